@@ -1,0 +1,486 @@
+import difflib
+import inspect
+import io
+import os
+import pathlib
+from collections.abc import Iterable
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.utils import polyak_update
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.sac.sac import SAC
+from torch.nn import functional as F
+
+from sb3_robust_bisim import losses
+from sb3_robust_bisim.atomic import atomic_path
+from sb3_robust_bisim.encoders import MlpEncoder
+from sb3_robust_bisim.intrinsic_reward import IntrinsicRewardVecEnv
+from sb3_robust_bisim.latent_models import DYNAMICS, Dynamics
+from sb3_robust_bisim.losses import DISTANCES, Distance
+from sb3_robust_bisim.policies import BisimActor, BisimCritic, BisimPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
+
+SelfBisimSAC = TypeVar("SelfBisimSAC", bound="BisimSAC")
+
+
+class BisimSAC(SAC):
+    """
+    Soft Actor-Critic whose encoder is shaped by a robust on-policy bisimulation metric.
+
+    Paper: Towards Robust Bisimulation Metric Learning (Kemertas and Aumentado-Armstrong, NeurIPS 2021).
+
+    One encoder z = phi(s), owned by the critic, is trained by critic, metric, dynamics, reward and inverse-dynamics
+    loss in one backward pass, and never by the actor loss. Each batch is encoded once.
+
+    The paper's methods are settings: SAC is ``bisim_coef=0, norm_constraint=False``; DBC ``norm_constraint=False``;
+    normed DBC the default; normed-IR adds ``intrinsic_reward_scale``, normed-ID ``inverse_dynamics_coef``.
+
+    :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a subclass of ``BisimPolicy``
+    :param env: the environment, or its id
+    :param bisim_coef: weight of the metric loss (eq:general-bisim-loss), >= 0; 0 turns it off
+    :param c_r: c_R, weight of the reward gap in the metric, >= 0
+    :param c_t: c_T, weight of the transition term, in [0, 1). None: ``gamma``
+    :param reward_range: (R_min, R_max) of one agent step, as the agent sees it: action repeat sums rewards. It sets the
+        radius of the norm constraint
+    :param norm_constraint: hold embeddings and predictions in the ball of eq:constraint, with radius
+        c_R (R_max - R_min) / (2 (1 - c_T))
+    :param distance: "huber" (elementwise, the paper's experiments), "l1" or "l2" (norms of the whole embedding);
+        see :func:`sb3_robust_bisim.losses.pairwise_distance`
+    :param dynamics: "deterministic", "probabilistic" (Gaussian) or "ensemble" (5 Gaussians)
+    :param model_coef: weight of dynamics and reward loss, >= 0. None: 1 where a model is needed, that is with
+        ``bisim_coef`` or ``intrinsic_reward_scale`` above 0, else 0
+    :param intrinsic_reward_scale: eta_r >= 0; 0 gives no bonus
+    :param intrinsic_reward_max: R_max_I >= 0, the largest bonus, in units of reward; clamped after scaling
+    :param inverse_dynamics_coef: eta_d >= 0, weight of the inverse-dynamics loss; 0 turns it off
+    :param policy_delay: actor and entropy coefficient are updated every ``policy_delay``-th gradient step. The target
+        nets follow SAC's ``target_update_interval``
+    :param initial_gradient_steps: gradient steps to do at once when learning starts, on the random actions gathered until
+        then (1000 in the published experiments)
+    :param kwargs: the arguments of :class:`stable_baselines3.SAC`; ``n_steps`` must stay 1
+
+    :raises ValueError: for a value outside its range, ``n_steps`` other than 1, image observations with MlpPolicy, a
+        VecNormalize that normalises rewards, an IntrinsicRewardVecEnv outside of VecNormalize, HER with a bonus
+    :raises TypeError: for an argument that does not exist
+
+    Example::
+
+        model = BisimSAC("MlpPolicy", "robust_bisim/SparseCartPole-v0", intrinsic_reward_scale=2.0, inverse_dynamics_coef=1.0)
+        model.learn(10_000, progress_bar=True)
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+    policy: BisimPolicy
+    actor: BisimActor
+    critic: BisimCritic
+    critic_target: BisimCritic
+
+    def __init__(
+        self,
+        policy: str | type[BisimPolicy],
+        env: GymEnv | str,
+        *,
+        bisim_coef: float = 0.5,
+        c_r: float = 1.0,
+        c_t: float | None = None,
+        reward_range: tuple[float, float] = (0.0, 1.0),
+        norm_constraint: bool = True,
+        distance: Distance = "huber",
+        dynamics: Dynamics = "deterministic",
+        model_coef: float | None = None,
+        intrinsic_reward_scale: float = 0.0,
+        intrinsic_reward_max: float = 0.1,
+        inverse_dynamics_coef: float = 0.0,
+        policy_delay: int = 2,
+        initial_gradient_steps: int = 0,
+        _init_setup_model: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        _check_names(kwargs)
+        if kwargs.get("policy_kwargs") is not None:
+            kwargs["policy_kwargs"] = dict(kwargs["policy_kwargs"])  # SB3 writes into it
+        super().__init__(policy, env, _init_setup_model=False, **kwargs)
+        self.bisim_coef = bisim_coef
+        self.c_r = c_r
+        self.c_t = c_t
+        self.reward_range = reward_range
+        self.norm_constraint = norm_constraint
+        self.distance = distance
+        self.dynamics = dynamics
+        self.model_coef = model_coef
+        self.intrinsic_reward_scale = intrinsic_reward_scale
+        self.intrinsic_reward_max = intrinsic_reward_max
+        self.inverse_dynamics_coef = inverse_dynamics_coef
+        self.policy_delay = policy_delay
+        self.initial_gradient_steps = initial_gradient_steps
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        self._check_arguments()
+        if self.env is not None:
+            self.env = self._bind_intrinsic_reward(self.env)
+        policy_kwargs = self.policy_kwargs
+        # The policy learns of our own arguments here and not in __init__, so that `load(..., c_t=0.5)` reaches it, and
+        # the user's dict is saved as it was given
+        self.policy_kwargs = {**policy_kwargs, "radius": self.radius, "dynamics": self.dynamics}
+        super()._setup_model()
+        self.policy_kwargs = policy_kwargs
+
+    @property
+    def radius(self) -> float | None:
+        """Radius of the ball that holds the embeddings (eq:constraint), None without ``norm_constraint``."""
+        return losses.ball_radius(self.c_r, self._c_t, self.reward_range) if self.norm_constraint else None
+
+    @property
+    def _c_t(self) -> float:
+        return self.gamma if self.c_t is None else self.c_t
+
+    @property
+    def _model_coef(self) -> float:
+        if self.model_coef is None:
+            return 1.0 if self.bisim_coef > 0 or self.intrinsic_reward_scale > 0 else 0.0
+        return self.model_coef
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        # Switch to train mode (this affects batch norm / dropout)
+        self.policy.set_training_mode(True)
+        # Update optimizers learning rate; the inverse-dynamics model keeps its own
+        optimizers = [self.actor.optimizer, self.critic.optimizer]
+        if self.ent_coef_optimizer is not None:
+            optimizers += [self.ent_coef_optimizer]
+        self._update_learning_rate(optimizers)
+
+        if self._n_updates == 0:
+            gradient_steps = max(gradient_steps, self.initial_gradient_steps)
+        inverse_dynamics = self.policy.inverse_dynamics
+        actor_parameters = self.policy.actor_parameters()
+        # Everything to be logged stays on the device until the end of the call
+        scalars: dict[str, list[th.Tensor]] = {}
+
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            # Sample replay buffer
+            replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
+            obs, next_obs = replay_data.observations, replay_data.next_observations
+
+            # We need to sample because `log_std` may have changed between two gradient steps
+            if self.use_sde:
+                self.actor.reset_noise()
+
+            # The only place where the batch is encoded, but for the target encoder
+            z = self.critic.encode(obs)
+            with th.set_grad_enabled(self.inverse_dynamics_coef > 0):
+                next_z = self.critic.encode(next_obs)
+
+            ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
+            with th.no_grad():
+                # Select action according to policy
+                next_actions, next_log_prob = self.actor.features_log_prob(self.actor.features(next_obs, next_z))
+                # Compute the next Q values: min over all critics targets
+                next_q_values = self.critic_target.q_values(self.critic_target.encode(next_obs), next_actions)
+                next_q_value = th.cat(next_q_values, dim=1).min(dim=1, keepdim=True).values
+                # add entropy term
+                next_q_value = next_q_value - ent_coef * next_log_prob.reshape(-1, 1)
+                # td error + entropy term
+                target_q_value = replay_data.rewards + (1 - replay_data.dones) * self.gamma * next_q_value
+
+            # Compute critic loss. No factor 0.5: it is one summand of the encoder's loss, weighted as published
+            current_q_values = self.critic.q_values(z, replay_data.actions)
+            step = {"train/critic_loss": th.stack([F.mse_loss(q, target_q_value) for q in current_q_values]).sum()}
+            weights = {"train/critic_loss": 1.0}
+            self._representation_losses(z, next_z, replay_data.actions, replay_data.rewards, step, weights)
+
+            # Optimize encoder, critic and models, in one backward pass
+            self.critic.optimizer.zero_grad()
+            inverse_dynamics.optimizer.zero_grad()
+            th.stack([weight * step[name] for name, weight in weights.items()]).sum().backward()
+            self.critic.optimizer.step()
+            inverse_dynamics.optimizer.step()
+
+            if self._n_updates % self.policy_delay == 0:
+                # Action by the current actor for the sampled state
+                actions_pi, log_prob = self.actor.features_log_prob(self.actor.features(obs, z))
+                log_prob = log_prob.reshape(-1, 1)
+                # Min over all critic networks
+                min_qf_pi = th.cat(self.critic.q_values(z.detach(), actions_pi), dim=1).min(dim=1, keepdim=True).values
+                step["train/actor_loss"] = (ent_coef * log_prob - min_qf_pi).mean()
+
+                # Optimize the actor, and compute no gradient of anything else
+                self.actor.optimizer.zero_grad()
+                step["train/actor_loss"].backward(inputs=actor_parameters)
+                self.actor.optimizer.step()
+
+                # Optimize entropy coefficient, also called
+                # entropy temperature or alpha in the paper
+                if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
+                    assert isinstance(self.target_entropy, float)
+                    ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
+                    step["train/ent_coef_loss"] = ent_coef_loss
+                    self.ent_coef_optimizer.zero_grad()
+                    ent_coef_loss.backward()
+                    self.ent_coef_optimizer.step()
+
+            # Update target networks. SAC tests the loop index, which is always 0 at `gradient_steps=1`
+            if self._n_updates % self.target_update_interval == 0:
+                polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+                # Copy running stats, see GH issue #996
+                polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+
+            step["train/ent_coef"] = ent_coef
+            for name, value in step.items():
+                scalars.setdefault(name, []).append(value.detach().reshape(()))
+
+        if gradient_steps > 0:
+            scalars.update({name: [value] for name, value in _embedding_statistics(z.detach(), self.radius).items()})
+            self._record(scalars, gradient_steps)
+
+    def _representation_losses(
+        self,
+        z: th.Tensor,
+        next_z: th.Tensor,
+        actions: th.Tensor,
+        rewards: th.Tensor,
+        step: dict[str, th.Tensor],
+        weights: dict[str, float],
+    ) -> None:
+        """
+        Add to ``step`` what shapes the encoder beside the critic, and to ``weights`` how much of it.
+
+        :param z: (B, n) embeddings, with gradient
+        :param next_z: (B, n) embeddings of the successors; only the inverse-dynamics loss sends gradient through them
+        :param actions: (B, n_a) in [-1, 1]
+        :param rewards: (B, 1)
+        """
+        if self.bisim_coef > 0 or self._model_coef > 0:
+            prediction = self.policy.dynamics(z, actions)
+        if self._model_coef > 0:
+            predicted_rewards = self.policy.reward_model(self.policy.dynamics.sample(prediction))
+            step["train/dynamics_loss"] = losses.dynamics_loss(prediction.mean, prediction.std, next_z)
+            step["train/reward_loss"] = F.mse_loss(predicted_rewards, rewards)
+            weights["train/dynamics_loss"] = weights["train/reward_loss"] = self._model_coef
+        if self.bisim_coef > 0:
+            mean, std = prediction.moments()
+            pairs = th.randperm(len(z), device=z.device)
+            step["train/bisim_loss"], step["bisim/mu_bd"], step["bisim/mu_rd"] = losses.bisim_loss(
+                z, rewards, mean, std, pairs, self.c_r, self._c_t, self.distance
+            )
+            weights["train/bisim_loss"] = self.bisim_coef
+        if self.inverse_dynamics_coef > 0:
+            predicted_actions = self.policy.inverse_dynamics(z, next_z)
+            step["train/inverse_dynamics_loss"] = losses.inverse_dynamics_loss(predicted_actions, actions)
+            weights["train/inverse_dynamics_loss"] = self.inverse_dynamics_coef
+
+    def _record(self, scalars: dict[str, list[th.Tensor]], gradient_steps: int) -> None:
+        """
+        Bring the call's numbers to the CPU, in one transfer, and log their means.
+
+        :raises ValueError: if one of them is not finite
+        """
+        values = th.cat([th.stack(steps) for steps in scalars.values()]).cpu().numpy()
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        means, start = {}, 0
+        for name, steps in scalars.items():
+            part = values[start : start + len(steps)]
+            start += len(steps)
+            if not np.isfinite(part).all():
+                # the actor's values exist for every `policy_delay`-th update only: count from where they would be
+                first = int(np.flatnonzero(~np.isfinite(part))[0] * gradient_steps / len(steps))
+                raise ValueError(
+                    f"{name} became {part[~np.isfinite(part)][0]} at update {self._n_updates - gradient_steps + 1 + first}: "
+                    "training has stopped. Load the last checkpoint, and lower learning_rate, set norm_constraint=True or "
+                    "check the range of observations and rewards."
+                )
+            means[name] = float(part.mean())
+            self.logger.record(name, means[name])
+        if self.bisim_coef > 0:
+            self.logger.record("bisim/mu_ratio", means["bisim/mu_bd"] / max(means["bisim/mu_rd"], 1e-8))
+            self.logger.record("bisim/mu_ratio_target", self.c_r / (1 - self._c_t))
+
+    @th.no_grad()
+    def _intrinsic_reward(self, obs: Any, actions: np.ndarray, next_obs: Any) -> np.ndarray:
+        """
+        The bonus of transitions as the environment sees them (sec:intrinsic).
+
+        :param obs: unnormalised observations, n_envs rows
+        :param actions: (n_envs, n_a) in the scale of the action space
+        :param next_obs: true successors
+        :return: (n_envs,)
+        """
+        if self._vec_normalize_env is not None:
+            obs, next_obs = self._vec_normalize_env.normalize_obs(obs), self._vec_normalize_env.normalize_obs(next_obs)
+        z = self.critic.encode(self.policy.obs_to_tensor(obs)[0])
+        next_z = self.critic.encode(self.policy.obs_to_tensor(next_obs)[0])
+        scaled_actions = th.as_tensor(self.policy.scale_action(actions), dtype=th.float32, device=self.device)
+        mean, _ = self.policy.dynamics(z, scaled_actions).moments()
+        return losses.intrinsic_reward(mean, next_z, self.intrinsic_reward_scale, self.intrinsic_reward_max).cpu().numpy()
+
+    def _bind_intrinsic_reward(self, env: VecEnv) -> VecEnv:
+        """
+        Bind the bonus to the IntrinsicRewardVecEnv in the chain, putting one outermost if there is none and one is
+        needed; without a bonus, unbind it, for another model may have been there.
+        """
+        chain, layer = [], env
+        while isinstance(layer, VecEnvWrapper):
+            chain.append(layer)
+            layer = layer.venv
+        wrapper = next((layer for layer in chain if isinstance(layer, IntrinsicRewardVecEnv)), None)
+        normalize = next((layer for layer in chain if isinstance(layer, VecNormalize)), None)
+        remedy = "use VecNormalize(IntrinsicRewardVecEnv(venv), norm_reward=False)."
+        if normalize is not None and normalize.norm_reward and normalize.training:
+            raise ValueError(
+                "VecNormalize(norm_reward=True): it rescales the rewards while they come in, so that neither the metric nor "
+                "reward_range has a fixed unit. Pass norm_reward=False."
+            )
+        if wrapper is not None and normalize is not None and chain.index(wrapper) < chain.index(normalize):
+            raise ValueError(f"IntrinsicRewardVecEnv outside of VecNormalize: its rewards would be ignored; {remedy}")
+        if self.intrinsic_reward_scale == 0:
+            if wrapper is not None:
+                wrapper.bind(None)
+            return env
+        if wrapper is None:
+            if normalize is not None:
+                raise ValueError(f"intrinsic_reward_scale={self.intrinsic_reward_scale} under VecNormalize: {remedy}")
+            env = wrapper = IntrinsicRewardVecEnv(env)
+        seen, wanted = wrapper.observation_space.shape, self.observation_space.shape
+        if (seen is None) != (wanted is None) or sorted(seen or ()) != sorted(wanted or ()):
+            raise ValueError(
+                f"IntrinsicRewardVecEnv sees observations of shape {seen}, the agent {wanted}: put it outside of the wrapper "
+                "that changes them (VecFrameStack, for example)."
+            )
+        wrapper.bind(self._intrinsic_reward)
+        return env
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        super().set_env(self._bind_intrinsic_reward(self._wrap_env(env, self.verbose)), force_reset)
+
+    def _store_transition(
+        self, replay_buffer: ReplayBuffer, buffer_action: np.ndarray, new_obs: Any, reward: np.ndarray, *args: Any
+    ) -> None:
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, *args)
+        infos = args[-1]
+        if "intrinsic_reward" in infos[0]:
+            self.logger.record_mean("rollout/intrinsic_reward", float(np.mean([info["intrinsic_reward"] for info in infos])))
+
+    def learn(
+        self: SelfBisimSAC,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "BisimSAC",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfBisimSAC:
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
+
+    def _check_arguments(self) -> None:
+        """Everything that can be refused before any work starts."""
+        for name in ("bisim_coef", "c_r", "intrinsic_reward_scale", "intrinsic_reward_max", "inverse_dynamics_coef"):
+            _require(np.isfinite(getattr(self, name)) and getattr(self, name) >= 0, self, name, "a finite number >= 0")
+        _require(self.model_coef is None or self.model_coef >= 0, self, "model_coef", "None or a number >= 0")
+        _require(self.c_t is None or 0 <= self.c_t < 1, self, "c_t", "None (gamma) or in [0, 1), else no metric exists")
+        _require(self.c_t is not None or self.gamma < 1, self, "gamma", "below 1 when c_t is None, which stands for gamma")
+        _require(
+            len(self.reward_range) == 2 and -np.inf < self.reward_range[0] < self.reward_range[1] < np.inf,
+            self,
+            "reward_range",
+            "(R_min, R_max), finite, with R_min < R_max",
+        )
+        _require(
+            not self.norm_constraint or self.c_r > 0, self, "c_r", "above 0, or norm_constraint=False: the ball is a point"
+        )
+        _require(self.distance in DISTANCES, self, "distance", f"one of {', '.join(DISTANCES)}")
+        _require(self.dynamics in DYNAMICS, self, "dynamics", f"one of {', '.join(DYNAMICS)}")
+        _require(self.policy_delay >= 1, self, "policy_delay", "an integer >= 1")
+        _require(self.initial_gradient_steps >= 0, self, "initial_gradient_steps", "an integer >= 0")
+
+        n_steps = self.replay_buffer_kwargs.get("n_steps", self.n_steps)
+        buffer_class = self.replay_buffer_class
+        if n_steps != 1 or (buffer_class is not None and issubclass(buffer_class, NStepReplayBuffer)):
+            raise ValueError(
+                f"n_steps={n_steps} (replay_buffer_class={buffer_class}): dynamics, inverse dynamics and metric are about one "
+                "step. Use n_steps=1 and no NStepReplayBuffer."
+            )
+        if self.intrinsic_reward_scale > 0 and buffer_class is not None and issubclass(buffer_class, HerReplayBuffer):
+            raise ValueError(
+                f"intrinsic_reward_scale={self.intrinsic_reward_scale} with HerReplayBuffer: relabelled transitions get the "
+                "environment's reward, without the bonus. Set intrinsic_reward_scale=0."
+            )
+        if not issubclass(self.policy_class, BisimPolicy):
+            raise ValueError(f"policy={self.policy_class}: it must be a subclass of sb3_robust_bisim.policies.BisimPolicy.")
+        extractor = self.policy_kwargs.get("features_extractor_class", MlpEncoder)
+        if self.policy_class is MlpPolicy and extractor is MlpEncoder and is_image_space(self.observation_space):
+            raise ValueError(f'policy="MlpPolicy" with images {self.observation_space}: use "CnnPolicy".')
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """Like SB3's ``save``; a file that existed before stays whole until the new one is."""
+        if not isinstance(path, (str, os.PathLike)):
+            return super().save(path, exclude, include)
+        with atomic_path(path if pathlib.Path(path).suffix else f"{path}.zip") as temporary:
+            super().save(temporary, exclude, include)
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """Like SB3's ``save_replay_buffer``; a file that existed before stays whole until the new one is."""
+        if not isinstance(path, (str, os.PathLike)):
+            return super().save_replay_buffer(path)
+        with atomic_path(path if pathlib.Path(path).suffix else f"{path}.pkl") as temporary:
+            super().save_replay_buffer(temporary)
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, tensors = super()._get_torch_save_params()
+        return [*state_dicts, "policy.inverse_dynamics.optimizer"], tensors
+
+
+def _embedding_statistics(z: th.Tensor, radius: float | None) -> dict[str, th.Tensor]:
+    """
+    What tells a collapse (std and norm near 0) from an explosion (norm without bound) or a ball that is too small.
+
+    :param z: (B, n)
+    """
+    norm = z.norm(dim=1)
+    statistics = {
+        "bisim/embedding_norm_mean": norm.mean(),
+        "bisim/embedding_norm_max": norm.max(),
+        "bisim/embedding_std": z.std(dim=0, unbiased=False).mean(),
+    }
+    if radius is not None:
+        # projected vectors lie on the surface, up to rounding
+        statistics["bisim/clamp_fraction"] = (norm > radius * (1 - 1e-6)).float().mean()
+    return statistics
+
+
+def _require(condition: bool, model: BisimSAC, name: str, remedy: str) -> None:
+    if not condition:
+        raise ValueError(f"{name}={getattr(model, name)!r}: it must be {remedy}.")
+
+
+def _check_names(kwargs: dict[str, Any]) -> None:
+    """Refuse an argument that neither BisimSAC nor SAC has, for a misspelt key in a config must not train half a method."""
+    known = [*inspect.signature(BisimSAC).parameters, *inspect.signature(SAC).parameters]
+    for name in kwargs:
+        if name not in known:
+            matches = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean {matches[0]!r}?" if matches else "see the documentation of BisimSAC and SAC."
+            raise TypeError(f"BisimSAC has no argument {name!r} (value {kwargs[name]!r}): {hint}")

@@ -1,0 +1,92 @@
+"""Encoders phi: observation -> embedding z. Their output is projected onto the ball by the policy, whatever the encoder."""
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, create_mlp
+from torch import nn
+
+
+class MlpEncoder(BaseFeaturesExtractor):
+    """
+    Encoder for flat observations: linear layers of one width with LeakyReLU between them.
+
+    :param observation_space: anything that flattens
+    :param features_dim: width n of the embedding and of the hidden layers
+    :param n_layers: linear layers, at least 1
+    :param layer_norm: normalise the embedding (and each hidden layer)
+    """
+
+    def __init__(
+        self, observation_space: spaces.Space, features_dim: int = 50, n_layers: int = 3, layer_norm: bool = False
+    ) -> None:
+        if n_layers < 1:
+            raise ValueError(f"n_layers={n_layers}: an encoder needs at least one layer.")
+        super().__init__(observation_space, features_dim)
+        input_dim = get_flattened_obs_dim(observation_space)
+        self.net = nn.Sequential(nn.Flatten(), *_mlp(input_dim, features_dim, n_layers, layer_norm))
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.net(observations)
+
+
+class PixelEncoder(BaseFeaturesExtractor):
+    """
+    The paper's pixel encoder: conv 3x3 stride 2 (32), conv 3x3 stride 1 (32), ReLU, linear to n, LayerNorm.
+
+    :param observation_space: channel-first image stack, (C, H, W)
+    :param features_dim: width n of the embedding
+    :param normalized_image: whether the space holds floats in [0, 1] already, see SB3's NatureCNN
+    """
+
+    def __init__(self, observation_space: spaces.Box, features_dim: int = 50, normalized_image: bool = False) -> None:
+        if not is_image_space(observation_space, check_channels=False, normalized_image=normalized_image):
+            raise ValueError(
+                f"CnnPolicy needs images, the observation space is {observation_space}: use MlpPolicy, or MultiInputPolicy "
+                "for a Dict. For images that are floats already, pass policy_kwargs=dict(normalize_images=False)."
+            )
+        super().__init__(observation_space, features_dim)
+        self.convs = nn.Sequential(
+            nn.Conv2d(observation_space.shape[0], 32, kernel_size=3, stride=2),
+            nn.ReLU(),
+            nn.Conv2d(32, 32, kernel_size=3, stride=1),
+            nn.ReLU(),
+            nn.Flatten(),
+        )
+        with th.no_grad():
+            n_flat = self.convs(th.zeros(1, *observation_space.shape)).shape[1]
+        self.head = nn.Sequential(nn.Linear(n_flat, features_dim), nn.LayerNorm(features_dim))
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.head(self.convs(observations))
+
+
+class CombinedEncoder(BaseFeaturesExtractor):
+    """
+    Encoder for Dict observations: SB3's CombinedExtractor, then an MLP down to the embedding.
+
+    :param observation_space: Dict of images and flat spaces
+    :param features_dim: width n of the embedding
+    :param cnn_output_dim: features per image
+    :param normalized_image: whether images are floats in [0, 1] already
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        features_dim: int = 50,
+        cnn_output_dim: int = 256,
+        normalized_image: bool = False,
+    ) -> None:
+        super().__init__(observation_space, features_dim)
+        self.combined = CombinedExtractor(observation_space, cnn_output_dim, normalized_image)
+        self.head = nn.Sequential(*_mlp(self.combined.features_dim, features_dim, n_layers=3, layer_norm=False))
+
+    def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
+        return self.head(self.combined(observations))
+
+
+def _mlp(input_dim: int, width: int, n_layers: int, layer_norm: bool) -> list[nn.Module]:
+    norm = [nn.LayerNorm] if layer_norm else []
+    layers = create_mlp(input_dim, -1, [width] * n_layers, nn.LeakyReLU, post_linear_modules=norm)  # type: ignore[arg-type]
+    return layers[:-1]  # the embedding itself is linear (or normalised)

@@ -1,0 +1,22 @@
+"""
+Environments of the paper. Importing this package registers their ids with Gymnasium and imports no torch.
+
+A worker process that has not imported it knows the ids by their long form, as any Gymnasium id:
+``sb3_robust_bisim.envs:robust_bisim/SparseCartPole-v0``.
+"""
+
+from gymnasium import register
+
+from sb3_robust_bisim.envs.noise import NoiseObservation
+
+__all__ = ["NoiseObservation"]
+
+# No reward_threshold for the sparse tasks: they are judged with the arguments of the evaluation, not with the defaults
+register("robust_bisim/SparseCartPole-v0", "sb3_robust_bisim.envs.classic:sparse_cart_pole", max_episode_steps=200)
+register("robust_bisim/SparsePendulum-v0", "sb3_robust_bisim.envs.classic:sparse_pendulum", max_episode_steps=200)
+register(
+    "robust_bisim/MountainCarContinuous-v0",
+    "sb3_robust_bisim.envs.classic:mountain_car_continuous",
+    reward_threshold=90.0,
+    max_episode_steps=999,
+)

@@ -1,0 +1,144 @@
+"""The objectives of the paper, one pure function per equation.
+
+Shapes: ``B`` is the batch size, ``n`` the width of the embedding, ``K`` the number of dynamics models.
+"""
+
+from typing import Literal, get_args
+
+import torch as th
+from torch.nn import functional as F
+
+Distance = Literal["huber", "l1", "l2"]
+DISTANCES: tuple[str, ...] = get_args(Distance)
+
+
+def ball_radius(c_r: float, c_t: float, reward_range: tuple[float, float]) -> float:
+    """
+    Radius of the ball that holds every embedding, eq:constraint: half the largest diameter that a bisimulation
+    metric can have (lemma:diam).
+
+    :param c_r: weight of the reward term, c_R >= 0
+    :param c_t: weight of the transition term, c_T in [0, 1)
+    :param reward_range: (R_min, R_max) per agent step
+    :return: c_R (R_max - R_min) / (2 (1 - c_T))
+    """
+    r_min, r_max = reward_range
+    return c_r * (r_max - r_min) / (2 * (1 - c_t))
+
+
+def project_to_ball(x: th.Tensor, radius: float | None) -> th.Tensor:
+    """
+    Scale the vectors that lie outside the closed L2 ball onto its surface; leave all others bit for bit as they are.
+
+    :param x: (..., n)
+    :param radius: None leaves everything as it is
+    :return: (..., n)
+    """
+    if radius is None:
+        return x
+    return x * (radius / x.norm(dim=-1, keepdim=True).clamp(min=radius))
+
+
+def pairwise_distance(x: th.Tensor, y: th.Tensor, distance: str) -> th.Tensor:
+    """
+    Distance between matching rows of two batches.
+
+    ``huber`` is ELEMENTWISE, as in the paper's experiments: every coordinate is a distance of its own and nothing is
+    reduced. ``l1`` and ``l2`` are the norms of eq:general-bisim-loss, reduced over the last dimension.
+
+    :param x: (B, n)
+    :param y: (B, n)
+    :param distance: "huber", "l1" or "l2"
+    :return: (B, n) for "huber", else (B, 1)
+    """
+    if distance == "huber":
+        return F.smooth_l1_loss(x, y, reduction="none")
+    return (x - y).norm(p=1 if distance == "l1" else 2, dim=-1, keepdim=True)
+
+
+def gaussian_w2(mean_i: th.Tensor, std_i: th.Tensor, mean_j: th.Tensor, std_j: th.Tensor, distance: str = "l2") -> th.Tensor:
+    """
+    2-Wasserstein distance between diagonal Gaussians.
+
+    Each coordinate's own W2 is sqrt(dmu^2 + dsigma^2). ``l2`` reduces it to the closed form of the whole Gaussian,
+    ``l1`` sums the coordinates (an upper bound of the W2 under the L1 ground metric, exact for point masses), and
+    ``huber`` keeps the coordinates apart as the paper's experiments do.
+
+    :param mean_i: (B, n), likewise the other three
+    :return: (B, n) for "huber", else (B, 1)
+    """
+    squared = (mean_i - mean_j).square() + (std_i - std_j).square()
+    if distance == "l2":
+        return squared.sum(dim=-1, keepdim=True).sqrt()
+    return squared.sqrt() if distance == "huber" else squared.sqrt().sum(dim=-1, keepdim=True)
+
+
+def bisim_loss(
+    z: th.Tensor,
+    rewards: th.Tensor,
+    mean: th.Tensor,
+    std: th.Tensor | None,
+    pairs: th.Tensor,
+    c_r: float,
+    c_t: float,
+    distance: str,
+) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+    """
+    Metric loss, eq:general-bisim-loss: mean over pairs of (d(z_i, z_j) - c_R |r_i - r_j| - c_T W(P_i, P_j))^2.
+    The target, reward gap plus transition term, carries no gradient.
+
+    With "huber" the reward gap is the Huber distance too, a (B, 1) column broadcast over the n coordinates.
+
+    :param z: (B, n) embeddings, the only input that receives gradient
+    :param rewards: (B, 1)
+    :param mean: (B, n) predicted next embeddings
+    :param std: (B, n), or None for point masses, where W is the distance between the means
+    :param pairs: (B,) row j that is paired with row i
+    :return: the loss and, for diagnosis and without gradient, the mean distances mu_bd and mu_rd (eq:reward-dependence2)
+    """
+    z_distance = pairwise_distance(z, z[pairs], distance)
+    with th.no_grad():
+        reward_distance = pairwise_distance(rewards, rewards[pairs], distance)
+        if std is None:
+            transition_distance = pairwise_distance(mean, mean[pairs], distance)
+        else:
+            transition_distance = gaussian_w2(mean, std, mean[pairs], std[pairs], distance)
+        target = c_r * reward_distance + c_t * transition_distance
+    return F.mse_loss(z_distance, target), z_distance.detach().mean(), reward_distance.mean()
+
+
+def dynamics_loss(mean: th.Tensor, std: th.Tensor | None, target: th.Tensor) -> th.Tensor:
+    """
+    Negative log-likelihood of the true next embedding, up to a constant, averaged over batch, coordinates and models.
+
+    :param mean: (K, B, n)
+    :param std: (K, B, n), or None for sigma = 1
+    :param target: (B, n) next embeddings; no gradient flows into them
+    """
+    error = mean - target.detach()
+    if std is None:
+        return 0.5 * error.square().mean()
+    return (0.5 * (error / std).square() + std.log()).mean()
+
+
+def inverse_dynamics_loss(predicted_actions: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """
+    J_d = |a - g_I(z, z')|_1 / n_a, mean over the batch.
+
+    :param predicted_actions: (B, n_a)
+    :param actions: (B, n_a) in [-1, 1]
+    """
+    return F.l1_loss(predicted_actions, actions)
+
+
+def intrinsic_reward(mean: th.Tensor, next_z: th.Tensor, scale: float, maximum: float) -> th.Tensor:
+    """
+    Forward-prediction bonus of sec:intrinsic: min(R_max_I, eta_r |mu(z, a) - phi(s')|^2 / (2n)), clamped after scaling.
+
+    :param mean: (B, n) predicted next embeddings
+    :param next_z: (B, n) embeddings of the true successors
+    :param scale: eta_r >= 0
+    :param maximum: R_max_I >= 0, in units of reward
+    :return: (B,)
+    """
+    return (0.5 * scale * (mean - next_z).square().mean(dim=-1)).clamp(max=maximum)

@@ -1,0 +1,174 @@
+"""The rl-zoo command line with BisimSAC known to it: training, resuming, tuning, playing and plotting are the zoo's."""
+
+import argparse
+import difflib
+import inspect
+import sys
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import optuna
+import rl_zoo3.cli
+import rl_zoo3.train
+import yaml
+from matplotlib.figure import Figure
+from rl_zoo3 import ALGOS
+from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, convert_offpolicy_params, sample_sac_params
+from stable_baselines3 import SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_robust_bisim.atomic import atomic_path
+from sb3_robust_bisim.bisim_sac import BisimSAC
+
+ALGO = "bisim_sac"
+DEFAULT_CONFIG = Path("zoo_configs/bisim_sac.yml")
+# What an entry of a zoo YAML may hold beside the arguments of the algorithm
+ZOO_KEYS = (
+    *("callback", "env_kwargs", "env_wrapper", "eval_env_kwargs", "frame_stack", "monitor_kwargs", "n_envs"),
+    *("n_timesteps", "noise_std", "noise_type", "normalize", "policy", "variants", "vec_env_wrapper"),
+)
+
+
+def sample_bisim_sac_params(
+    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+) -> dict[str, Any]:
+    """Optuna's search space: that of SAC, and the weights of metric, bonus and inverse dynamics."""
+    return {
+        **sample_sac_params(trial, n_actions, n_envs, additional_args),
+        "bisim_coef": trial.suggest_float("bisim_coef", 0.05, 5.0, log=True),
+        "intrinsic_reward_scale": trial.suggest_float("intrinsic_reward_scale", 0.01, 20.0, log=True),
+        "inverse_dynamics_coef": trial.suggest_float("inverse_dynamics_coef", 0.01, 20.0, log=True),
+        "policy_delay": trial.suggest_int("policy_delay", 1, 2),
+    }
+
+
+ALGOS[ALGO] = BisimSAC
+HYPERPARAMS_SAMPLER[ALGO] = sample_bisim_sac_params
+HYPERPARAMS_CONVERTER[ALGO] = convert_offpolicy_params
+
+
+def variant_settings(config: str | Path, env_id: str, variant: str) -> dict[str, Any]:
+    """
+    The settings that a named variant of a config file lays over the entry of a task.
+
+    :param config: YAML file with a mapping ``variants``, and perhaps another one inside the task's entry
+    :param env_id: the task
+    :param variant: name of the method, "DBC" for example
+    :raises ValueError: if the file knows no such variant
+    """
+    content = yaml.safe_load(Path(config).read_text())
+    variants = content.get("variants", {})
+    if variant not in variants:
+        raise ValueError(f"--variant {variant}: {config} has {', '.join(variants) or 'no variants'}.")
+    return {**variants[variant], **content.get(env_id, {}).get("variants", {}).get(variant, {})}
+
+
+def check_keys(hyperparams: dict[str, Any], source: str) -> None:
+    """
+    Refuse keys that nobody would read, before a run folder exists.
+
+    :param hyperparams: an entry of a config file for BisimSAC
+    :param source: file name, for the message
+    :raises ValueError: naming the key and the closest known one
+    """
+    known = {*ZOO_KEYS, *inspect.signature(BisimSAC).parameters, *inspect.signature(SAC).parameters} - {"kwargs", "env"}
+    for key in hyperparams:
+        if key not in known:
+            hint = difflib.get_close_matches(key, known, n=1)
+            raise ValueError(f"{source}: unknown key {key!r}" + (f", did you mean {hint[0]!r}?" if hint else "."))
+
+
+class BisimExperimentManager(ExperimentManager):
+    """The zoo's experiment manager, plus named variants, evaluation in another task, key checks and a report at the end."""
+
+    variant: ClassVar[str | None] = None
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        # What a config file was written for is not known before it is read: the command line wins over the variant
+        if self.variant is not None:
+            settings = variant_settings(self.config, self.env_name.gym_id, self.variant)
+            self.custom_hyperparams = {**settings, **(self.custom_hyperparams or {})}
+        hyperparams, saved_hyperparams = super().read_hyperparameters()
+        if self.algo == ALGO:
+            check_keys(hyperparams, self.config)
+        for settings in (hyperparams, saved_hyperparams):
+            settings.pop("variants", None)
+        self.args.variant = self.variant  # kept in the run's args.yml
+        env_kwargs = self.env_kwargs or hyperparams.get("env_kwargs", {})
+        eval_kwargs = hyperparams.pop("eval_env_kwargs", {})
+        self.eval_env_kwargs = {**env_kwargs, **eval_kwargs, **(self._eval_env_kwargs_args or {})}
+        return hyperparams, saved_hyperparams
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        super().save_trained_model(model)
+        report(Path(self.save_path), f"{self.env_name} {self.variant or self.algo}")
+        print(f"Model:          {self.save_path}/{self.env_name}.zip")
+        if self.tensorboard_log:
+            print(f"TensorBoard:    tensorboard --logdir {self.tensorboard_log}")
+
+
+def report(run: Path, title: str) -> None:
+    """
+    Draw the learning curve of a run and print where it began and where it ended.
+
+    :param run: folder with the ``evaluations.npz`` of SB3's EvalCallback; without one there is nothing to report
+    :param title: of the picture
+    """
+    if not (run / "evaluations.npz").exists():
+        return
+    with np.load(run / "evaluations.npz") as evaluations:
+        steps, returns = evaluations["timesteps"], evaluations["results"]
+    mean, standard_error = returns.mean(axis=1), returns.std(axis=1) / np.sqrt(returns.shape[1])
+    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(steps, mean, marker=".")
+    axes.fill_between(steps, mean - standard_error, mean + standard_error, alpha=0.25)
+    axes.set(title=title, xlabel="environment steps", ylabel=f"evaluation return, mean of {returns.shape[1]} episodes")
+    axes.grid(alpha=0.3)
+    with atomic_path(run / "learning_curve.png") as temporary:
+        figure.savefig(temporary, dpi=120, format="png")
+    print(f"Evaluation return (mean of {returns.shape[1]} episodes): {mean[0]:.1f} at step {steps[0]}", end=", ")
+    print(f"{mean[-1]:.1f} at step {steps[-1]}")
+    print(f"Learning curve: {run / 'learning_curve.png'}")
+
+
+def main() -> None:
+    """``python -m sb3_robust_bisim COMMAND``: hand over to the zoo, with our defaults filled in."""
+    rl_zoo3.train.ExperimentManager = BisimExperimentManager  # type: ignore[misc]
+    commands = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots")
+    if len(sys.argv) < 2 or sys.argv[1] not in commands:
+        print(f"usage: python -m sb3_robust_bisim {{{','.join(commands)}}} ...\n\nEach command has --help.", file=sys.stderr)
+        sys.exit(0 if sys.argv[1:] in (["-h"], ["--help"]) else 2)
+    if sys.argv[1] == "train":
+        sys.argv[2:] = _train_arguments(sys.argv[2:])
+    elif sys.argv[1] == "enjoy" and "--algo" not in sys.argv:
+        sys.argv[2:2] = ["--algo", ALGO]
+    rl_zoo3.cli.main()
+
+
+def _train_arguments(arguments: list[str]) -> list[str]:
+    """Take out ``--variant``, which the zoo does not know, and fill in the defaults of ``--algo`` and ``--conf-file``."""
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_robust_bisim train",
+        add_help=False,
+        allow_abbrev=False,
+        description="The zoo's train command, plus:",
+    )
+    parser.add_argument("--variant", help="method of the config file, for example SAC, DBC, normed-IR-ID (default: the entry)")
+    parser.add_argument("--algo", default=ALGO, help="RL algorithm (default: %(default)s)")
+    parser.add_argument(
+        "-conf", "--conf-file", help=f"hyperparameters (default: {DEFAULT_CONFIG} for {ALGO}, if that file is here)"
+    )
+    if "-h" in arguments or "--help" in arguments:
+        parser.print_help()
+        print()
+    ours, theirs = parser.parse_known_args(arguments)
+    BisimExperimentManager.variant = ours.variant
+    config = ours.conf_file or (str(DEFAULT_CONFIG) if ours.algo == ALGO and DEFAULT_CONFIG.is_file() else None)
+    if ours.algo == ALGO and config is None and not {"-h", "--help"} & set(arguments):
+        parser.error(f"-conf is needed: {DEFAULT_CONFIG} is not in this folder.")
+    if config is not None and config.endswith((".yml", ".yaml")) and not Path(config).is_file():
+        parser.error(f"-conf {config}: there is no such file.")
+    return ["--algo", ours.algo, *(["-conf", config] if config else []), *theirs]

@@ -51,13 +51,13 @@ class Record(BaseCallback):
 
     def _on_step(self) -> bool:
         norm = self.logger.name_to_value.get("bisim/embedding_norm_max", 0.0)
-        self.largest_norm = max(self.largest_norm, float(norm))  # type: ignore[arg-type]
+        self.largest_norm = max(self.largest_norm, float(norm))
         if self.num_timesteps % self.every == 0:
-            mean_return, _ = evaluate_policy(self.model, self.eval_env, n_eval_episodes=10)
+            returns, _ = evaluate_policy(self.model, self.eval_env, n_eval_episodes=10, return_episode_rewards=True)
             self.run["evaluations"].append(
                 {
                     "step": self.num_timesteps,
-                    "mean_return": float(mean_return),
+                    "mean_return": float(np.mean(returns)),
                     "largest_norm_so_far": self.largest_norm,
                 }
             )

@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: help setup train test lint type docs clean
+.PHONY: help setup train test test-sb3 lint type clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -22,6 +22,21 @@ train: setup  ## the full method on noisy sparse cartpole (two distractors per s
 
 test: setup  ## all tests
 	$(BIN)/python -m pytest -n 2
+
+SB3_TESTS := run save_load cnn train_eval_mode her dict_env vec_normalize callbacks predict sde spaces deterministic \
+	custom_policy tensorboard gae
+# see CONTRIBUTING.md for the reason of each
+SB3_LEFT_OUT := test_cnn.py::test_image_like_input[True-BisimSAC] test_cnn.py::test_image_like_input[False-BisimSAC] \
+	test_dict_env.py::test_vec_normalize[BisimSAC] test_vec_normalize.py::test_her_normalization \
+	test_vec_normalize.py::test_offpolicy_normalization[BisimSAC] test_tensorboard.py::test_tensorboard[sac] \
+	test_gae.py::test_infinite_horizon[True-BisimSAC]
+
+test-sb3: setup  ## Stable-Baselines3's own tests of SAC, with BisimSAC in its place
+	mkdir -p build && cd build && rm -rf stable_baselines3-* && \
+		../$(BIN)/pip download --quiet --no-deps --no-binary :all: -c ../constraints.txt stable_baselines3 && \
+		tar xzf stable_baselines3-*.tar.gz && cd stable_baselines3-*/ && \
+		PYTHONPATH=../../tests/upstream ../../$(BIN)/python -m pytest -p swap_sac -q -n 2 -k "BisimSAC or sac or her or train_freq" \
+		$(foreach test,$(SB3_LEFT_OUT),"--deselect=tests/$(test)") $(SB3_TESTS:%=tests/test_%.py)
 
 lint: setup  ## ruff: style and format
 	$(BIN)/ruff check .

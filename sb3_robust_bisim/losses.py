@@ -36,7 +36,7 @@ def project_to_ball(x: th.Tensor, radius: float | None) -> th.Tensor:
     """
     if radius is None:
         return x
-    return x * (radius / x.norm(dim=-1, keepdim=True).clamp(min=radius))
+    return x / (x.norm(dim=-1, keepdim=True) / radius).clamp(min=1.0)
 
 
 def pairwise_distance(x: th.Tensor, y: th.Tensor, distance: str) -> th.Tensor:

@@ -1,0 +1,172 @@
+"""The bonus wrapper: real transitions, terminal ones included, under every wrapper that it may meet."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import FakeImageEnv
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack, VecNormalize, is_vecenv_wrapped
+
+from sb3_robust_bisim import BisimSAC, IntrinsicRewardVecEnv
+
+ENV = "robust_bisim/SparsePendulum-v0"
+SMALL = dict(learning_starts=10, batch_size=8, seed=0, policy_kwargs=dict(net_arch=[16]))
+
+
+class Countdown(gym.Env):
+    """Episodes of three steps whose observation tells the episode and the step, with actions in [-2, 2]."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space = spaces.Box(-2, 2, (1,), np.float32)
+
+    def __init__(self, as_dict: bool = False) -> None:
+        self.episode, self.as_dict = 0, as_dict
+        if as_dict:
+            self.observation_space = spaces.Dict({"a": Countdown.observation_space})
+
+    def _obs(self) -> Any:
+        obs = np.array([self.episode, self.t], dtype=np.float32)
+        return {"a": obs} if self.as_dict else obs
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Any, dict]:
+        super().reset(seed=seed)
+        self.episode, self.t = self.episode + 1, 0
+        return self._obs(), {}
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict]:
+        self.t += 1
+        return self._obs(), 5.0, self.t == 3, False, {}
+
+
+@pytest.mark.parametrize("as_dict", [False, True])
+def test_the_bonus_sees_the_true_successor_also_at_the_end_of_an_episode(as_dict: bool) -> None:
+    venv = IntrinsicRewardVecEnv(DummyVecEnv([lambda: Countdown(as_dict)]))
+    seen = []
+
+    def bonus(obs: Any, actions: np.ndarray, next_obs: Any) -> np.ndarray:
+        seen.append([(o["a"] if as_dict else o)[0].tolist() for o in (obs, next_obs)])
+        return np.array([0.25])
+
+    venv.bind(bonus)
+    venv.reset()
+    for _ in range(5):
+        _, rewards, _, infos = venv.step(np.zeros((1, 1)))
+        assert rewards.tolist() == [5.25]
+        assert infos[0]["intrinsic_reward"] == 0.25
+    transitions = [[[1, 0], [1, 1]], [[1, 1], [1, 2]], [[1, 2], [1, 3]], [[2, 0], [2, 1]], [[2, 1], [2, 2]]]
+    assert seen == transitions
+
+
+def test_the_stored_reward_is_reward_plus_the_formula_for_every_transition() -> None:
+    arguments = dict(intrinsic_reward_scale=0.1, intrinsic_reward_max=0.03, learning_starts=100)
+    model = BisimSAC("MlpPolicy", DummyVecEnv([Countdown, Countdown]), **{**SMALL, **arguments})
+    model.learn(18)  # random actions only: the models stay as they were built
+    buffer = model.replay_buffer
+    for step in range(9):
+        obs, next_obs = (th.as_tensor(array[step]) for array in (buffer.observations, buffer.next_observations))
+        assert next_obs[:, 1].tolist() == (obs[:, 1] + 1).tolist()  # the terminal transition too leads to its own episode
+        with th.no_grad():
+            z, next_z = model.critic.encode(obs), model.critic.encode(next_obs)
+            mean = model.policy.dynamics(z, th.as_tensor(buffer.actions[step])).mean[0]
+        n = z.shape[1]
+        expected = np.minimum(0.03, 0.1 * ((mean - next_z) ** 2).sum(dim=1).numpy() / (2 * n))
+        np.testing.assert_allclose(buffer.rewards[step], 5.0 + expected, rtol=1e-5)
+    assert 0 < (buffer.rewards[:9] == np.float32(5.03)).mean() < 1  # the clamp bites, and not always
+
+
+def test_actions_are_scaled_to_what_the_buffer_holds() -> None:
+    model = BisimSAC("MlpPolicy", DummyVecEnv([Countdown]), intrinsic_reward_scale=1.0, **SMALL)
+    obs = np.array([[1.0, 0.0]], dtype=np.float32)
+    seen = []
+    model.policy.dynamics.register_forward_hook(lambda module, inputs, output: seen.append(inputs[1].item()))
+    model._intrinsic_reward(obs, np.array([[2.0]]), obs)
+    model._intrinsic_reward(obs, np.array([[-1.0]]), obs)
+    assert seen == [1.0, -0.5]
+
+
+def test_unbound_it_passes_everything_through() -> None:
+    plain, wrapped = make_vec_env(ENV, 2, seed=3), IntrinsicRewardVecEnv(make_vec_env(ENV, 2, seed=3))
+    np.testing.assert_array_equal(plain.reset(), wrapped.reset())
+    for _ in range(210):
+        actions = np.full((2, 1), 0.7)
+        for left, right in zip(plain.step(actions)[:3], wrapped.step(actions)[:3], strict=True):
+            np.testing.assert_array_equal(left, right)
+    assert "intrinsic_reward" not in wrapped.step(actions)[3][0]
+
+
+def chain(env: VecEnv | None) -> list[str]:
+    names = []
+    while env is not None:
+        names.append(type(env).__name__)
+        env = getattr(env, "venv", None)
+    return names
+
+
+def test_it_is_added_once_and_survives_set_env_and_load(tmp_path: Any) -> None:
+    model = BisimSAC("MlpPolicy", ENV, intrinsic_reward_scale=1.0, **SMALL)
+    wrapped = ["IntrinsicRewardVecEnv", "DummyVecEnv"]
+    assert chain(model.get_env()) == wrapped
+    model.set_env(model.get_env())
+    assert chain(model.get_env()) == wrapped
+    model.set_env(gym.make(ENV))
+    assert chain(model.get_env()) == wrapped
+    model.learn(20)
+    model.save(tmp_path / "m")
+    for env in (gym.make(ENV), model.get_env()):
+        loaded = BisimSAC.load(tmp_path / "m", env=env)
+        assert chain(loaded.get_env()) == wrapped
+        loaded.learn(5, reset_num_timesteps=False)
+        assert "rollout/intrinsic_reward" in loaded.logger.name_to_value
+    assert BisimSAC.load(tmp_path / "m").get_env() is None
+
+
+def test_a_model_without_bonus_unbinds_the_wrapper_that_another_left_bound() -> None:
+    env = BisimSAC("MlpPolicy", DummyVecEnv([Countdown]), intrinsic_reward_scale=1.0, **SMALL).get_env()
+    model = BisimSAC("MlpPolicy", env, **SMALL).learn(12)
+    assert model.replay_buffer.rewards[:12].tolist() == [[5.0]] * 12
+
+
+def test_under_vecnormalize_it_reads_normalised_observations_and_reaches_the_buffer() -> None:
+    venv = VecNormalize(IntrinsicRewardVecEnv(DummyVecEnv([Countdown])), norm_reward=False)
+    model = BisimSAC("MlpPolicy", venv, intrinsic_reward_scale=1e6, intrinsic_reward_max=0.5, **SMALL)
+    encoded = []
+    model.critic.features_extractor.register_forward_pre_hook(lambda module, inputs: encoded.append(inputs[0].clone()))
+    model.learn(9)
+    np.testing.assert_allclose(model.replay_buffer.rewards[:9], 5.5)
+    obs = np.array([[2.0, 1.0]], dtype=np.float32)
+    model._intrinsic_reward(obs, np.zeros((1, 1)), obs)
+    np.testing.assert_array_equal(encoded[-1], venv.normalize_obs(obs))
+    assert not np.allclose(encoded[-1], obs)
+
+
+def test_frame_stacks_below_it_are_seen_whole() -> None:
+    def make_env() -> gym.Env:
+        return FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False)
+
+    stack = VecFrameStack(DummyVecEnv([make_env]), 3)
+    model = BisimSAC("CnnPolicy", stack, intrinsic_reward_scale=1.0, buffer_size=50, **SMALL).learn(20)
+    assert chain(model.get_env())[0] == "IntrinsicRewardVecEnv"
+    inside = VecFrameStack(IntrinsicRewardVecEnv(DummyVecEnv([make_env])), 3)
+    with pytest.raises(ValueError, match="VecFrameStack"):
+        BisimSAC("CnnPolicy", inside, intrinsic_reward_scale=1.0, buffer_size=50, **SMALL)
+
+
+def test_it_works_with_environments_in_other_processes() -> None:
+    venv = SubprocVecEnv([Countdown, Countdown], start_method="forkserver")
+    model = BisimSAC("MlpPolicy", venv, intrinsic_reward_scale=1e6, intrinsic_reward_max=0.5, **SMALL).learn(24)
+    np.testing.assert_allclose(model.replay_buffer.rewards[:12], 5.5)
+    venv.close()
+
+
+def test_evaluation_and_monitor_show_the_extrinsic_return() -> None:
+    model = BisimSAC(
+        "MlpPolicy", make_vec_env(Countdown, 1), intrinsic_reward_scale=1e6, intrinsic_reward_max=0.5, **SMALL
+    ).learn(12)
+    assert {episode["r"] for episode in model.ep_info_buffer} == {15.0}
+    assert evaluate_policy(model, model.get_env(), n_eval_episodes=2)[0] == 15.0
+    assert is_vecenv_wrapped(model.get_env(), IntrinsicRewardVecEnv)

@@ -1,0 +1,153 @@
+"""The mathematics: each loss against an independent computation."""
+
+import numpy as np
+import ot
+import pytest
+import torch as th
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_robust_bisim import losses
+
+SETTINGS = settings(max_examples=50, deadline=None, derandomize=True)
+
+
+def normal(*shape: int, seed: int = 0) -> th.Tensor:
+    return th.as_tensor(np.random.default_rng(seed).normal(size=shape))
+
+
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 12))
+@SETTINGS
+def test_w2_of_diagonal_gaussians_is_the_optimal_transport_of_pot(seed: int, n: int) -> None:
+    mean_i, mean_j, raw_i, raw_j = normal(4, n, seed=seed)
+    std_i, std_j = raw_i.exp(), raw_j.exp()
+    expected = ot.gaussian.bures_wasserstein_distance(mean_i, mean_j, th.diag(std_i**2), th.diag(std_j**2))
+    distance = losses.gaussian_w2(mean_i[None], std_i[None], mean_j[None], std_j[None])
+    assert distance.shape == (1, 1)
+    assert distance.item() == pytest.approx(float(expected), rel=1e-6, abs=1e-6)
+
+
+def test_w2_of_each_coordinate_is_that_of_one_dimensional_gaussians() -> None:
+    mean_i, mean_j, raw_i, raw_j = normal(4, 5)
+    std_i, std_j = raw_i.exp(), raw_j.exp()
+    expected = [
+        float(
+            ot.gaussian.bures_wasserstein_distance(*(x.reshape(1) for x in row[:2]), *(x.reshape(1, 1) ** 2 for x in row[2:]))
+        )
+        for row in zip(mean_i, mean_j, std_i, std_j, strict=True)
+    ]
+    arguments = mean_i[None], std_i[None], mean_j[None], std_j[None]
+    np.testing.assert_allclose(losses.gaussian_w2(*arguments, distance="huber")[0], expected)
+    assert losses.gaussian_w2(*arguments, distance="l1").item() == pytest.approx(sum(expected))
+
+
+def test_w2_of_equal_spreads_is_the_distance_of_the_means() -> None:
+    mean_i, mean_j, std = normal(3, 4, 6)
+    for distance in ("l1", "l2"):
+        w2 = losses.gaussian_w2(mean_i, std.exp(), mean_j, std.exp(), distance)
+        th.testing.assert_close(w2, losses.pairwise_distance(mean_i, mean_j, distance))
+
+
+def test_huber_is_elementwise_and_the_norms_reduce_the_embedding() -> None:
+    x, y = th.tensor([[0.0, 3.0, 0.5]]), th.zeros(1, 3)
+    assert losses.pairwise_distance(x, y, "huber").tolist() == [[0.0, 2.5, 0.125]]
+    assert losses.pairwise_distance(x, y, "l1").tolist() == [[3.5]]
+    assert losses.pairwise_distance(x, y, "l2").item() == pytest.approx(np.sqrt(9.25))
+
+
+@given(seed=st.integers(0, 2**32 - 1), radius=st.floats(0.1, 100), scale=st.floats(0.01, 1000))
+@SETTINGS
+def test_projection_ends_in_the_ball_keeps_directions_and_leaves_the_interior_alone(
+    seed: int, radius: float, scale: float
+) -> None:
+    x = (scale * normal(20, 7, seed=seed)).float()
+    x[0] = 0
+    projected, norm = losses.project_to_ball(x, radius), x.norm(dim=1)
+    assert (projected.norm(dim=1) <= radius * (1 + 1e-6)).all()
+    inside = norm <= radius
+    assert th.equal(projected[inside], x[inside])
+    th.testing.assert_close(projected[~inside], x[~inside] / norm[~inside, None] * radius)
+    assert th.equal(losses.project_to_ball(x, None), x)
+
+
+def test_the_gradient_of_the_projection_is_finite_at_the_origin() -> None:
+    x = th.zeros(1, 3, requires_grad=True)
+    losses.project_to_ball(x, 1.0).sum().backward()
+    assert x.grad.tolist() == [[1.0, 1.0, 1.0]]
+
+
+@pytest.mark.parametrize(
+    ("c_r", "c_t", "reward_range", "radius"),
+    [(1.0, 0.99, (0.0, 1.0), 50.0), (0.5, 0.5, (0.0, 1.0), 0.5), (1.0, 0.0, (-2.0, 4.0), 3.0), (2.0, 0.9, (0.0, 1.1), 11.0)],
+)
+def test_the_radius_follows_from_c_r_c_t_and_the_reward_range(
+    c_r: float, c_t: float, reward_range: tuple[float, float], radius: float
+) -> None:
+    assert losses.ball_radius(c_r, c_t, reward_range) == pytest.approx(radius)
+
+
+@pytest.mark.parametrize("distance", losses.DISTANCES)
+@pytest.mark.parametrize("gaussian", [False, True])
+def test_metric_loss_is_the_papers_formula_written_as_loops(distance: str, gaussian: bool) -> None:
+    z, mean, raw = normal(3, 6, 4)
+    rewards, std = normal(6, 1, seed=1), raw.exp() if gaussian else None
+    pairs, c_r, c_t = th.tensor([3, 0, 5, 1, 2, 4]), 0.7, 0.9
+
+    def d(x: float) -> float:
+        return (0.5 * x**2 if abs(x) < 1 else abs(x) - 0.5) if distance == "huber" else abs(x)
+
+    def norm(x: list[float]) -> float:
+        return float(np.sqrt(np.square(x).sum()) if distance == "l2" else np.sum(x))
+
+    terms = []
+    for i, j in enumerate(pairs.tolist()):
+        reward_gap = d(float(rewards[i] - rewards[j]))
+        z_gaps = [d(float(x)) for x in z[i] - z[j]]
+        if std is None:
+            transition_gaps = [d(float(x)) for x in mean[i] - mean[j]]
+        else:
+            squares = (mean[i] - mean[j]) ** 2 + (std[i] - std[j]) ** 2
+            transition_gaps = [float(x) ** 0.5 for x in squares]
+        if distance == "huber":
+            terms += [(a - c_r * reward_gap - c_t * b) ** 2 for a, b in zip(z_gaps, transition_gaps, strict=True)]
+        else:
+            terms.append((norm(z_gaps) - c_r * reward_gap - c_t * norm(transition_gaps)) ** 2)
+    loss, mu_bd, mu_rd = losses.bisim_loss(z, rewards, mean, std, pairs, c_r, c_t, distance)
+    assert loss.item() == pytest.approx(np.mean(terms))
+    assert mu_bd.item() == pytest.approx(losses.pairwise_distance(z, z[pairs], distance).mean().item())
+    assert mu_rd.item() == pytest.approx(np.mean([d(float(rewards[i] - rewards[j])) for i, j in enumerate(pairs)]))
+
+
+@pytest.mark.parametrize("distance", losses.DISTANCES)
+def test_the_target_of_the_metric_loss_carries_no_gradient(distance: str) -> None:
+    z, rewards, mean, std = (normal(8, n, seed=n).requires_grad_() for n in (4, 1, 4, 4))
+    loss, *_ = losses.bisim_loss(z, rewards, mean, std.exp(), th.randperm(8), 1.0, 0.99, distance)
+    loss.backward()
+    assert z.grad.abs().sum() > 0
+    assert rewards.grad is None
+    assert mean.grad is None
+    assert std.grad is None
+
+
+def test_dynamics_loss_is_the_gaussian_log_likelihood_and_leaves_its_target_alone() -> None:
+    mean, raw = normal(2, 3, 5, 4)
+    target = normal(5, 4, seed=2).requires_grad_()
+    expected = -th.distributions.Normal(mean, raw.exp()).log_prob(target).mean() - 0.5 * np.log(2 * np.pi)
+    mean.requires_grad_()
+    loss = losses.dynamics_loss(mean, raw.exp(), target)
+    assert loss.item() == pytest.approx(expected.item())
+    assert losses.dynamics_loss(mean, None, target).item() == pytest.approx(0.5 * (mean - target).square().mean().item())
+    loss.backward()
+    assert mean.grad.abs().sum() > 0
+    assert target.grad is None
+
+
+def test_inverse_dynamics_loss_is_the_l1_distance_per_action_dimension() -> None:
+    predicted, actions = th.tensor([[0.5, -1.0], [0.0, 0.0]]), th.tensor([[0.0, 1.0], [0.0, 1.0]])
+    assert losses.inverse_dynamics_loss(predicted, actions).item() == pytest.approx((2.5 / 2 + 1 / 2) / 2)
+
+
+def test_the_bonus_is_clamped_after_scaling() -> None:
+    mean, next_z = th.tensor([[1.0, 0.0], [3.0, 1.0]]), th.zeros(2, 2)
+    # eta_r |.|^2 / (2n): 4 * 1 / 4 and 4 * 10 / 4
+    assert losses.intrinsic_reward(mean, next_z, scale=4.0, maximum=2.0).tolist() == [1.0, 2.0]

@@ -1,0 +1,163 @@
+"""The command line, run as a user runs it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import optuna
+import pytest
+import yaml
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER
+
+from sb3_robust_bisim import BisimSAC
+from sb3_robust_bisim.zoo import check_keys, main, sample_bisim_sac_params, variant_settings
+
+ROOT = Path(__file__).parent.parent
+CONFIG = ROOT / "zoo_configs" / "bisim_sac.yml"
+CARTPOLE, PENDULUM, MOUNTAIN_CAR = (
+    f"robust_bisim/{name}-v0" for name in ("SparseCartPole", "SparsePendulum", "MountainCarContinuous")
+)
+SAC = dict(bisim_coef=0, norm_constraint=False, intrinsic_reward_scale=0, inverse_dynamics_coef=0)
+SHORT = ["-n", "120", "-params", "learning_starts:50", "batch_size:16", "initial_gradient_steps:5"]
+
+
+class Zoo:
+    """The command line in this process: importing torch and the zoo anew takes longer than any of these runs."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+        self.monkeypatch, self.capsys = monkeypatch, capsys
+
+    def __call__(self, *arguments: str) -> str:
+        self.monkeypatch.chdir(ROOT)
+        self.monkeypatch.setattr(sys, "argv", ["sb3_robust_bisim", *arguments])
+        try:
+            main()
+        finally:
+            captured = self.capsys.readouterr()
+            self.output = captured.out + captured.err
+        return self.output
+
+
+@pytest.fixture
+def zoo(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> Zoo:
+    return Zoo(monkeypatch, capsys)
+
+
+@pytest.mark.parametrize(
+    ("variant", "expected"),
+    [
+        ("SAC", SAC),
+        ("DBC", {**SAC, "bisim_coef": 0.5}),
+        ("DBC-alt", {**SAC, "bisim_coef": 0.5, "c_r": 0.5, "c_t": 0.5}),
+        ("DBC-normed", {**SAC, "bisim_coef": 0.5, "norm_constraint": True}),
+        ("DBC-IR", {"norm_constraint": False, "inverse_dynamics_coef": 0}),
+        ("normed-IR", {"inverse_dynamics_coef": 0}),
+        ("normed-ID", {"intrinsic_reward_scale": 0}),
+        ("normed-IR-ID", {}),
+    ],
+)
+def test_every_method_of_the_paper_is_a_variant(variant: str, expected: dict) -> None:
+    for env_id in (CARTPOLE, MOUNTAIN_CAR):
+        assert variant_settings(CONFIG, env_id, variant) == expected
+    layers = {"policy_kwargs": {"features_extractor_kwargs": {"n_layers": 3}}}
+    normed = expected.get("norm_constraint", True)
+    assert variant_settings(CONFIG, PENDULUM, variant) == (expected if normed else {**expected, **layers})
+
+
+@pytest.mark.parametrize("env_id", [CARTPOLE, PENDULUM, MOUNTAIN_CAR])
+def test_the_config_files_hold_known_keys_and_the_papers_numbers(env_id: str) -> None:
+    entry = yaml.safe_load(CONFIG.read_text())[env_id]
+    check_keys(entry, str(CONFIG))
+    paper = {CARTPOLE: (2, 1, 50_000), PENDULUM: (0.1, 0.1, 100_000), MOUNTAIN_CAR: (20, 20, 100_000)}[env_id]
+    assert (entry["intrinsic_reward_scale"], entry["inverse_dynamics_coef"], entry["n_timesteps"]) == paper
+    assert (entry["batch_size"], entry["buffer_size"], entry["learning_rate"]) == (512, 50_000, 1e-3)
+
+
+def test_train_evaluates_in_the_standard_task_and_reports_and_resumes_and_plays(zoo: Zoo, tmp_path: Path) -> None:
+    common = ["--seed", "1", "--eval-freq", "40", "--eval-episodes", "2", "-f", str(tmp_path)]
+    output = zoo("train", "--env", CARTPOLE, "--variant", "normed-ID", *common, "-tb", str(tmp_path / "tb"), *SHORT)
+    run = tmp_path / "bisim_sac" / "robust_bisim-SparseCartPole-v0_1"
+    evaluations = np.load(run / "evaluations.npz")
+    assert evaluations["timesteps"].tolist() == [40, 80, 120]
+    # in the standard task every step pays 1, in the sparse one almost none does
+    np.testing.assert_array_equal(evaluations["results"], evaluations["ep_lengths"])
+    assert f"{evaluations['results'][-1].mean():.1f} at step 120" in output
+    assert (run / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
+    folder = run / "robust_bisim-SparseCartPole-v0"
+    assert yaml.unsafe_load((folder / "args.yml").read_text())["variant"] == "normed-ID"
+    model = BisimSAC.load(run / "robust_bisim-SparseCartPole-v0.zip")
+    assert (model.intrinsic_reward_scale, model.inverse_dynamics_coef, model.batch_size) == (0.0, 1.0, 16)
+    assert model.observation_space.shape == (12,)  # noise_multiplier: 2 from the config
+    assert list((tmp_path / "tb").rglob("events.out.tfevents*"))
+
+    resumed = zoo("train", "--env", CARTPOLE, *common, "-i", str(run / "robust_bisim-SparseCartPole-v0.zip"), *SHORT)
+    assert "Loading pretrained agent" in resumed
+    assert (tmp_path / "bisim_sac" / "robust_bisim-SparseCartPole-v0_2" / "robust_bisim-SparseCartPole-v0.zip").exists()
+    played = zoo("enjoy", "--env", CARTPOLE, "-f", str(tmp_path), "--exp-id", "1", "-n", "30", "--no-render")
+    assert "Episode Reward" in played or "Loading" in played
+
+
+def test_env_kwargs_of_the_command_line_reach_training_and_evaluation(zoo: Zoo, tmp_path: Path) -> None:
+    zoo(
+        *("train", "--env", CARTPOLE, "--env-kwargs", "noise_multiplier:1", "--eval-freq", "60", "--eval-episodes", "1"),
+        *("-f", str(tmp_path), *SHORT),
+    )
+    run = tmp_path / "bisim_sac" / "robust_bisim-SparseCartPole-v0_1"
+    assert BisimSAC.load(run / "robust_bisim-SparseCartPole-v0.zip").observation_space.shape == (8,)
+    evaluations = np.load(run / "evaluations.npz")
+    np.testing.assert_array_equal(evaluations["results"], evaluations["ep_lengths"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--variant", "normed-ir"], "--variant normed-ir: .* has SAC, DBC"),
+        (["-params", "bisim_coeff:1"], "unknown key 'bisim_coeff', did you mean 'bisim_coef'"),
+    ],
+)
+def test_bad_input_is_refused_before_a_run_folder_exists(zoo: Zoo, arguments: list[str], message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        zoo("train", "--env", CARTPOLE, *arguments, "-f", str(tmp_path / "logs"))
+    assert not (tmp_path / "logs").exists()
+
+
+def test_a_missing_config_file_is_named(zoo: Zoo) -> None:
+    with pytest.raises(SystemExit) as stop:
+        zoo("train", "--env", CARTPOLE, "-conf", "nowhere.yml")
+    assert stop.value.code == 2
+    assert "-conf nowhere.yml: there is no such file" in zoo.output
+
+
+def test_a_misspelt_key_in_a_config_file_is_named(zoo: Zoo, tmp_path: Path) -> None:
+    config = tmp_path / "typo.yml"
+    content = yaml.safe_load(CONFIG.read_text())
+    content[CARTPOLE]["n_timestep"] = content[CARTPOLE].pop("n_timesteps")
+    config.write_text(yaml.dump(content))
+    with pytest.raises(ValueError, match="unknown key 'n_timestep', did you mean 'n_timesteps'"):
+        zoo("train", "--env", CARTPOLE, "-conf", str(config), "-f", str(tmp_path / "logs"))
+    assert not (tmp_path / "logs").exists()
+
+
+def test_optuna_samples_arguments_that_bisim_sac_takes() -> None:
+    def objective(trial: optuna.Trial) -> float:
+        sampled = sample_bisim_sac_params(trial, 1, 1, {"using_her_replay_buffer": False, "her_kwargs": {}})
+        model = BisimSAC("MlpPolicy", CARTPOLE, buffer_size=100, **sampled)
+        assert model.intrinsic_reward_scale == trial.params["intrinsic_reward_scale"]
+        assert HYPERPARAMS_CONVERTER["bisim_sac"](trial.params) == sampled
+        return model.bisim_coef
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    study.optimize(objective, n_trials=3)
+    assert len({trial.value for trial in study.trials}) == 3
+
+
+def test_it_runs_as_a_module_and_help_tells_of_the_commands_and_of_our_options(zoo: Zoo) -> None:
+    command = [sys.executable, "-m", "sb3_robust_bisim", "--help"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=True)
+    assert "train,enjoy,plot_train,plot_from_file,all_plots" in result.stderr
+    with pytest.raises(SystemExit):
+        zoo("train", "--help")
+    assert "--variant" in zoo.output
+    assert "--eval-freq" in zoo.output

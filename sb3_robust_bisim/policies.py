@@ -5,7 +5,7 @@ from typing import Any
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.policies import BaseModel, ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
@@ -20,25 +20,39 @@ from sb3_robust_bisim.losses import project_to_ball
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
 
 
+def _inside_ball(
+    model: BaseModel, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor, radius: float | None, bf16: bool
+) -> th.Tensor:
+    """The encoder's output for ``obs`` in fp32 and inside the ball; the encoder itself runs under autocast if asked to."""
+    with th.autocast(model.device.type, th.bfloat16, enabled=bf16):
+        features = BaseModel.extract_features(model, obs, features_extractor)
+    return project_to_ball(features.float(), radius)
+
+
 class BisimActor(Actor):
     """
     SAC's actor, split where the encoder ends so that a batch encoded once can be given to it.
 
     :param radius: radius of the ball that holds the embeddings, None for no constraint
+    :param bf16: run the encoder under bfloat16 autocast
     :param detach_features: whether the encoder belongs to the critic, so that no gradient may reach it from here
     """
 
-    def __init__(self, *args: Any, radius: float | None = None, detach_features: bool = True, **kwargs: Any) -> None:
+    def __init__(
+        self, *args: Any, radius: float | None = None, bf16: bool = False, detach_features: bool = True, **kwargs: Any
+    ) -> None:
         super().__init__(*args, **kwargs)
         self.radius = radius
+        self.bf16 = bf16
         self.detach_features = detach_features
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "radius": self.radius, "detach_features": self.detach_features}
+        own = {"radius": self.radius, "bf16": self.bf16, "detach_features": self.detach_features}
+        return {**super()._get_constructor_parameters(), **own}
 
     def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
         with th.set_grad_enabled(th.is_grad_enabled() and not self.detach_features):
-            return project_to_ball(super().extract_features(obs, features_extractor), self.radius)
+            return _inside_ball(self, obs, features_extractor, self.radius, self.bf16)
 
     def features(self, obs: PyTorchObs, z: th.Tensor) -> th.Tensor:
         """
@@ -71,14 +85,16 @@ class BisimCritic(ContinuousCritic):
     SAC's critic, owner of the encoder, split where the encoder ends.
 
     :param radius: radius of the ball that holds the embeddings, None for no constraint
+    :param bf16: run the encoder under bfloat16 autocast
     """
 
-    def __init__(self, *args: Any, radius: float | None = None, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, radius: float | None = None, bf16: bool = False, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.radius = radius
+        self.bf16 = bf16
 
     def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
-        return project_to_ball(super().extract_features(obs, features_extractor), self.radius)
+        return _inside_ball(self, obs, features_extractor, self.radius, self.bf16)
 
     def encode(self, obs: PyTorchObs) -> th.Tensor:
         """z = phi(s) inside the ball, (B, n)."""
@@ -103,6 +119,7 @@ class BisimPolicy(SACPolicy):
 
     :param radius: radius of the ball (eq:constraint), None for no constraint. Set by BisimSAC, like ``dynamics``
     :param dynamics: "deterministic", "probabilistic" or "ensemble"
+    :param bf16: run the encoder under bfloat16 autocast. Set by BisimSAC too
     :param share_features_extractor: True: the actor reads the critic's encoder and never trains it. False: it has one
         of its own, trained by the actor loss as in SB3's SAC; the metric then shapes the critic's alone
     :param inverse_dynamics_optimizer_kwargs: Adam's arguments for the inverse-dynamics model. Its learning rate is
@@ -126,6 +143,7 @@ class BisimPolicy(SACPolicy):
         share_features_extractor: bool = True,
         radius: float | None = None,
         dynamics: str = "deterministic",
+        bf16: bool = False,
         inverse_dynamics_optimizer_kwargs: dict[str, Any] | None = None,
         ortho_init: bool = True,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
@@ -134,6 +152,7 @@ class BisimPolicy(SACPolicy):
     ) -> None:
         self.radius = radius
         self.dynamics_kind = dynamics
+        self.bf16 = bf16
         self.inverse_dynamics_optimizer_kwargs = inverse_dynamics_optimizer_kwargs or dict(lr=1e-4, weight_decay=1e-5)
         self.ortho_init = ortho_init
         optimizer_kwargs = dict(optimizer_kwargs or {})
@@ -183,11 +202,12 @@ class BisimPolicy(SACPolicy):
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> BisimActor:
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
-        return BisimActor(**kwargs, radius=self.radius, detach_features=self.share_features_extractor).to(self.device)
+        own = dict(radius=self.radius, bf16=self.bf16, detach_features=self.share_features_extractor)
+        return BisimActor(**kwargs, **own).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> BisimCritic:
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        return BisimCritic(**kwargs, radius=self.radius).to(self.device)
+        return BisimCritic(**kwargs, radius=self.radius, bf16=self.bf16).to(self.device)
 
     def set_training_mode(self, mode: bool) -> None:
         super().set_training_mode(mode)
@@ -200,6 +220,7 @@ class BisimPolicy(SACPolicy):
             "share_features_extractor": self.share_features_extractor,
             "radius": self.radius,
             "dynamics": self.dynamics_kind,
+            "bf16": self.bf16,
             "inverse_dynamics_optimizer_kwargs": self.inverse_dynamics_optimizer_kwargs,
             "ortho_init": self.ortho_init,
         }

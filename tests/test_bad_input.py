@@ -1,0 +1,221 @@
+"""What cannot work is refused before any work starts, by a message that names the argument and its value."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv, SimpleMultiObsEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.her import HerReplayBuffer
+from stable_baselines3.sac.policies import SACPolicy
+
+from sb3_robust_bisim import BisimSAC, IntrinsicRewardVecEnv
+from sb3_robust_bisim.policies import CnnPolicy, MlpPolicy
+
+NAN, INF = float("nan"), float("inf")
+
+
+def pendulum() -> gym.Env:
+    return gym.make("Pendulum-v1", max_episode_steps=10)
+
+
+def venv() -> VecEnv:
+    return DummyVecEnv([pendulum])
+
+
+def images() -> gym.Env:
+    return FakeImageEnv(screen_height=12, screen_width=12, n_channels=1, discrete=False)
+
+
+def dicts() -> gym.Env:
+    return SimpleMultiObsEnv(discrete_actions=False)
+
+
+def make_model(policy: Any = "MlpPolicy", env: Any = None, **kwargs: Any) -> Any:
+    settings: dict[str, Any] = dict(
+        policy_kwargs=dict(net_arch=[16]),
+        learning_starts=10,
+        batch_size=8,
+        buffer_size=50,
+        seed=0,
+        intrinsic_reward_scale=1.0,
+        inverse_dynamics_coef=1.0,
+    )
+    return BisimSAC(policy, pendulum() if env is None else env, **{**settings, **kwargs})
+
+
+WEIGHTS = ("bisim_coef", "c_r", "model_coef", "intrinsic_reward_scale", "intrinsic_reward_max", "inverse_dynamics_coef")
+OUT_OF_RANGE: list[tuple[str, Any]] = [
+    *((name, value) for name in WEIGHTS for value in (-0.1, NAN, INF, "1")),
+    *(("c_t", value) for value in (1.0, 1.5, -0.1, NAN, "0.5")),
+    *(("reward_range", value) for value in ((1, 0), (1, 1), (0,), (0, 1, 2), (0, INF), (NAN, 1), None, 1.0, "ab")),
+    *(("distance", value) for value in ("L1", None)),
+    *(("dynamics", value) for value in ("gaussian", None)),
+    *(("policy_delay", value) for value in (0, -1, NAN, 1.5, "2", None)),
+    *(("initial_gradient_steps", value) for value in (-1, 1.5, None)),
+]
+
+
+@pytest.mark.parametrize(("name", "value"), OUT_OF_RANGE)
+def test_a_value_out_of_range_is_refused_by_name(name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=re.escape(f"{name}={value!r}: it must be ")):
+        make_model(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (dict(gamma=1.0), "gamma=1.0: it must be below 1 when c_t is None"),
+        (dict(c_r=0), "c_r=0: it must be above 0, or norm_constraint=False"),
+        (dict(n_steps=3), "n_steps=3 .* Use n_steps=1"),
+        (dict(replay_buffer_kwargs=dict(n_steps=3)), "n_steps=3 .* Use n_steps=1"),
+        (dict(n_steps=3, replay_buffer_kwargs=dict(n_steps=1)), "n_steps=3 .* Use n_steps=1"),
+        (dict(replay_buffer_class=NStepReplayBuffer), "NStepReplayBuffer"),
+        (dict(train_freq="4"), "train_freq"),
+    ],
+)
+def test_settings_without_a_meaning_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_model(**settings)
+
+
+def test_the_same_settings_are_taken_where_they_have_one() -> None:
+    make_model(gamma=1.0, c_t=0.9)
+    make_model(c_r=0, norm_constraint=False)
+    make_model(c_t=0, bisim_coef=0, model_coef=0, intrinsic_reward_max=0, reward_range=[-1, 0])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "right"),
+    [("bisim_coeff", "bisim_coef"), ("intrinsic_reward", "intrinsic_reward_max"), ("learning_start", "learning_starts")],
+)
+def test_a_misspelt_argument_is_refused_with_the_right_one(wrong: str, right: str) -> None:
+    with pytest.raises(TypeError, match=rf"no argument '{wrong}' \(value 3\): did you mean '{right}'\?"):
+        make_model(**{wrong: 3})
+
+
+def test_an_argument_like_no_other_is_refused() -> None:
+    with pytest.raises(TypeError, match=r"no argument 'xyz' \(value 3\): see the documentation"):
+        make_model(xyz=3)
+
+
+def test_discrete_actions_are_refused() -> None:
+    with pytest.raises(AssertionError, match=r"Discrete\(2\) was provided"):
+        make_model(env=gym.make("CartPole-v1"))
+
+
+@pytest.mark.parametrize(
+    ("policy", "env", "message"),
+    [
+        ("MlpPolicy", images, 'policy="MlpPolicy" with images .*: use "CnnPolicy"'),
+        (MlpPolicy, images, 'policy="MlpPolicy" with images .*: use "CnnPolicy"'),
+        ("CnnPolicy", pendulum, r"CnnPolicy needs images, .* Box\(.*: use MlpPolicy"),
+        (CnnPolicy, dicts, r"CnnPolicy needs images, .* Dict\(.*MultiInputPolicy"),
+        ("MlpPolicy", dicts, "MultiInputPolicy"),
+        (MlpPolicy, dicts, "MultiInputPolicy"),
+        ("MultiInputPolicy", pendulum, r"Box\("),
+        (SACPolicy, pendulum, r"policy=.*SACPolicy'>: it must be a subclass of .*BisimPolicy"),
+        (3, pendulum, "policy=3"),
+        ("Mlp", pendulum, "Policy Mlp unknown"),
+    ],
+)
+def test_a_policy_that_does_not_fit_is_refused(policy: Any, env: Callable[[], gym.Env], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_model(policy, env())
+
+
+def test_hindsight_replay_with_a_bonus_is_refused() -> None:
+    env = BitFlippingEnv(n_bits=4, continuous=True)
+    with pytest.raises(ValueError, match=r"intrinsic_reward_scale=0\.5 with HerReplayBuffer"):
+        make_model("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, intrinsic_reward_scale=0.5)
+
+
+RIGHT_ORDER = r"use VecNormalize\(IntrinsicRewardVecEnv\(venv\), norm_reward=False\)"
+CHAINS: list[tuple[Callable[[], VecEnv], str]] = [
+    (lambda: VecNormalize(venv(), norm_obs=False), r"VecNormalize\(norm_reward=True\).*Pass norm_reward=False"),
+    (lambda: VecNormalize(IntrinsicRewardVecEnv(venv())), r"VecNormalize\(norm_reward=True\).*Pass norm_reward=False"),
+    (
+        lambda: IntrinsicRewardVecEnv(VecNormalize(venv(), norm_reward=False)),
+        f"IntrinsicRewardVecEnv outside of VecNormalize.*{RIGHT_ORDER}",
+    ),
+    (lambda: VecNormalize(venv(), norm_reward=False), rf"intrinsic_reward_scale=1\.0 under VecNormalize: {RIGHT_ORDER}"),
+]
+
+
+@pytest.mark.parametrize(("chain", "message"), CHAINS)
+def test_wrappers_in_the_wrong_order_are_refused_at_every_door(
+    chain: Callable[[], VecEnv], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_model(env=chain())
+    model = make_model()
+    before = model.get_env()
+    with pytest.raises(ValueError, match=message):
+        model.set_env(chain())
+    assert model.get_env() is before
+    model.save(tmp_path / "model")
+    with pytest.raises(ValueError, match=message):
+        BisimSAC.load(tmp_path / "model", env=chain())
+
+
+@pytest.mark.parametrize(("policy", "env"), [("MlpPolicy", pendulum), ("MultiInputPolicy", dicts)])
+def test_a_bonus_below_a_frame_stack_is_refused(policy: str, env: Callable[[], gym.Env]) -> None:
+    with pytest.raises(ValueError, match=r"IntrinsicRewardVecEnv sees observations of .* outside .*VecFrameStack"):
+        make_model(policy, VecFrameStack(IntrinsicRewardVecEnv(DummyVecEnv([env])), 2))
+
+
+def test_an_environment_with_other_spaces_is_refused_as_such() -> None:
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        make_model().set_env(gym.make("MountainCarContinuous-v0"))
+
+
+@pytest.mark.parametrize(("name", "value"), [("c_t", 1.5), ("reward_range", (1, 0)), ("n_steps", 3), ("policy_delay", 0)])
+def test_load_refuses_what_the_constructor_refuses(name: str, value: Any, tmp_path: Path) -> None:
+    make_model().save(tmp_path / "model")
+    with pytest.raises(ValueError, match=re.escape(f"{name}={value!r}")):
+        BisimSAC.load(tmp_path / "model", **{name: value})
+
+
+def test_load_refuses_a_misspelt_argument(tmp_path: Path) -> None:
+    make_model().save(tmp_path / "model")
+    with pytest.raises(TypeError, match="did you mean 'bisim_coef'"):
+        BisimSAC.load(tmp_path / "model", bisim_coeff=0.1)
+
+
+class RewardAt(gym.Wrapper):
+    """One reward of the run is not a number: a sensor that fails at step ``step``."""
+
+    def __init__(self, step: int, reward: float) -> None:
+        super().__init__(pendulum())
+        self.failing_step, self.reward, self.count = step, reward, 0
+
+    def step(self, action: np.ndarray) -> Any:
+        self.count += 1
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        return obs, self.reward if self.count == self.failing_step else reward, terminated, truncated, info
+
+
+@pytest.mark.parametrize("reward", [NAN, INF])
+def test_a_reward_that_is_not_finite_stops_training_and_tells_where(reward: float) -> None:
+    model = make_model(env=RewardAt(14, reward), batch_size=300)  # so large a batch misses no transition
+    with pytest.raises(ValueError, match=rf"train/critic_loss became {reward} at update 4: training has stopped"):
+        model.learn(30)
+    assert model.num_timesteps == 14
+
+
+def test_the_update_is_named_also_inside_many_gradient_steps() -> None:
+    model = make_model(env=RewardAt(14, NAN), batch_size=300, train_freq=5, gradient_steps=6)
+    with pytest.raises(ValueError, match="train/critic_loss became nan at update 1: training has stopped"):
+        model.learn(30)
+
+
+@pytest.mark.parametrize("gradient_steps", [1, 5])
+def test_an_exploding_learning_rate_stops_training_and_tells_where(gradient_steps: int) -> None:
+    model = make_model(learning_rate=100.0, gradient_steps=gradient_steps)
+    with pytest.raises(ValueError, match=r"train/critic_loss became (nan|inf) at update \d: .* lower learning_rate"):
+        model.learn(30)

@@ -1,5 +1,3 @@
-import difflib
-import inspect
 import io
 import os
 import pathlib
@@ -8,22 +6,21 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from stable_baselines3 import HerReplayBuffer
-from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
-from stable_baselines3.common.utils import polyak_update
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.utils import check_for_correct_spaces, polyak_update
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_wrapper
 from stable_baselines3.sac.sac import SAC
 from torch.nn import functional as F
 
 from sb3_robust_bisim import losses
 from sb3_robust_bisim.atomic import atomic_path
-from sb3_robust_bisim.encoders import MlpEncoder
-from sb3_robust_bisim.intrinsic_reward import IntrinsicRewardVecEnv
-from sb3_robust_bisim.latent_models import DYNAMICS, Dynamics
-from sb3_robust_bisim.losses import DISTANCES, Distance
+from sb3_robust_bisim.checks import check_arguments, check_names
+from sb3_robust_bisim.fast_paths import exact_onednn_matmul, unchecked_distributions
+from sb3_robust_bisim.intrinsic_reward import IntrinsicRewardVecEnv, with_intrinsic_reward
+from sb3_robust_bisim.latent_models import Dynamics
+from sb3_robust_bisim.losses import Distance
 from sb3_robust_bisim.policies import BisimActor, BisimCritic, BisimPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 
 SelfBisimSAC = TypeVar("SelfBisimSAC", bound="BisimSAC")
@@ -108,7 +105,7 @@ class BisimSAC(SAC):
         _init_setup_model: bool = True,
         **kwargs: Any,
     ) -> None:
-        _check_names(kwargs)
+        check_names(BisimSAC, kwargs)
         if kwargs.get("policy_kwargs") is not None:
             kwargs["policy_kwargs"] = dict(kwargs["policy_kwargs"])  # SB3 writes into it
         super().__init__(policy, env, _init_setup_model=False, **kwargs)
@@ -131,7 +128,7 @@ class BisimSAC(SAC):
             self._setup_model()
 
     def _setup_model(self) -> None:
-        self._check_arguments()
+        check_arguments(self)
         if self.env is not None:
             self.env = self._bind_intrinsic_reward(self.env)
         policy_kwargs = self.policy_kwargs
@@ -157,6 +154,10 @@ class BisimSAC(SAC):
         return self.model_coef
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        with unchecked_distributions(), exact_onednn_matmul(self.device):
+            self._train(gradient_steps, batch_size)
+
+    def _train(self, gradient_steps: int, batch_size: int) -> None:
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
         # Update optimizers learning rate; the inverse-dynamics model keeps its own
@@ -170,7 +171,7 @@ class BisimSAC(SAC):
         inverse_dynamics = self.policy.inverse_dynamics
         actor_parameters = self.policy.actor_parameters()
         # Everything to be logged stays on the device until the end of the call
-        scalars: dict[str, list[th.Tensor]] = {}
+        scalars: dict[str, list[tuple[int, th.Tensor]]] = {}
 
         for _ in range(gradient_steps):
             self._n_updates += 1
@@ -243,11 +244,11 @@ class BisimSAC(SAC):
 
             step["train/ent_coef"] = ent_coef
             for name, value in step.items():
-                scalars.setdefault(name, []).append(value.detach().reshape(()))
+                scalars.setdefault(name, []).append((self._n_updates, value.detach().reshape(())))
 
         if gradient_steps > 0:
-            scalars.update({name: [value] for name, value in _embedding_statistics(z.detach(), self.radius).items()})
-            self._record(scalars, gradient_steps)
+            statistics = _embedding_statistics(z.detach(), self.radius)
+            self._record({**scalars, **{name: [(self._n_updates, value)] for name, value in statistics.items()}})
 
     def _representation_losses(
         self,
@@ -285,31 +286,31 @@ class BisimSAC(SAC):
             step["train/inverse_dynamics_loss"] = losses.inverse_dynamics_loss(predicted_actions, actions)
             weights["train/inverse_dynamics_loss"] = self.inverse_dynamics_coef
 
-    def _record(self, scalars: dict[str, list[th.Tensor]], gradient_steps: int) -> None:
+    def _record(self, scalars: dict[str, list[tuple[int, th.Tensor]]]) -> None:
         """
         Bring the call's numbers to the CPU, in one transfer, and log their means.
 
+        :param scalars: for each TensorBoard key the numbers of the updates that gave a value, and the values
         :raises ValueError: if one of them is not finite
         """
-        values = th.cat([th.stack(steps) for steps in scalars.values()]).cpu().numpy()
+        flat = th.stack([value for steps in scalars.values() for _, value in steps]).cpu().tolist()
+        values = iter(flat)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        means, start = {}, 0
+        means = {}
         for name, steps in scalars.items():
-            part = values[start : start + len(steps)]
-            start += len(steps)
-            if not np.isfinite(part).all():
-                # the actor's values exist for every `policy_delay`-th update only: count from where they would be
-                first = int(np.flatnonzero(~np.isfinite(part))[0] * gradient_steps / len(steps))
-                raise ValueError(
-                    f"{name} became {part[~np.isfinite(part)][0]} at update {self._n_updates - gradient_steps + 1 + first}: "
-                    "training has stopped. Load the last checkpoint, and lower learning_rate, set norm_constraint=True or "
-                    "check the range of observations and rewards."
-                )
-            means[name] = float(part.mean())
+            of_name = [next(values) for _ in steps]
+            for (update, _), value in zip(steps, of_name, strict=True):
+                if not np.isfinite(value):
+                    raise ValueError(
+                        f"{name} became {value} at update {update}: training has stopped. Load the last checkpoint, and lower "
+                        "learning_rate, set norm_constraint=True or check the range of observations and rewards."
+                    )
+            means[name] = float(np.mean(of_name))
             self.logger.record(name, means[name])
         if self.bisim_coef > 0:
-            self.logger.record("bisim/mu_ratio", means["bisim/mu_bd"] / max(means["bisim/mu_rd"], 1e-8))
             self.logger.record("bisim/mu_ratio_target", self.c_r / (1 - self._c_t))
+            if means["bisim/mu_rd"] > 0:  # all rewards equal: no ratio
+                self.logger.record("bisim/mu_ratio", means["bisim/mu_bd"] / means["bisim/mu_rd"])
 
     @th.no_grad()
     def _intrinsic_reward(self, obs: Any, actions: np.ndarray, next_obs: Any) -> np.ndarray:
@@ -325,48 +326,41 @@ class BisimSAC(SAC):
             obs, next_obs = self._vec_normalize_env.normalize_obs(obs), self._vec_normalize_env.normalize_obs(next_obs)
         z = self.critic.encode(self.policy.obs_to_tensor(obs)[0])
         next_z = self.critic.encode(self.policy.obs_to_tensor(next_obs)[0])
-        scaled_actions = th.as_tensor(self.policy.scale_action(actions), dtype=th.float32, device=self.device)
+        scaled_actions = th.as_tensor(self.policy.scale_action(actions), dtype=th.float32, device=self.device).flatten(1)
         mean, _ = self.policy.dynamics(z, scaled_actions).moments()
         return losses.intrinsic_reward(mean, next_z, self.intrinsic_reward_scale, self.intrinsic_reward_max).cpu().numpy()
 
     def _bind_intrinsic_reward(self, env: VecEnv) -> VecEnv:
-        """
-        Bind the bonus to the IntrinsicRewardVecEnv in the chain, putting one outermost if there is none and one is
-        needed; without a bonus, unbind it, for another model may have been there.
-        """
-        chain, layer = [], env
-        while isinstance(layer, VecEnvWrapper):
-            chain.append(layer)
-            layer = layer.venv
-        wrapper = next((layer for layer in chain if isinstance(layer, IntrinsicRewardVecEnv)), None)
-        normalize = next((layer for layer in chain if isinstance(layer, VecNormalize)), None)
-        remedy = "use VecNormalize(IntrinsicRewardVecEnv(venv), norm_reward=False)."
-        if normalize is not None and normalize.norm_reward and normalize.training:
-            raise ValueError(
-                "VecNormalize(norm_reward=True): it rescales the rewards while they come in, so that neither the metric nor "
-                "reward_range has a fixed unit. Pass norm_reward=False."
-            )
-        if wrapper is not None and normalize is not None and chain.index(wrapper) < chain.index(normalize):
-            raise ValueError(f"IntrinsicRewardVecEnv outside of VecNormalize: its rewards would be ignored; {remedy}")
-        if self.intrinsic_reward_scale == 0:
-            if wrapper is not None:
-                wrapper.bind(None)
-            return env
-        if wrapper is None:
-            if normalize is not None:
-                raise ValueError(f"intrinsic_reward_scale={self.intrinsic_reward_scale} under VecNormalize: {remedy}")
-            env = wrapper = IntrinsicRewardVecEnv(env)
-        seen, wanted = wrapper.observation_space.shape, self.observation_space.shape
-        if (seen is None) != (wanted is None) or sorted(seen or ()) != sorted(wanted or ()):
-            raise ValueError(
-                f"IntrinsicRewardVecEnv sees observations of shape {seen}, the agent {wanted}: put it outside of the wrapper "
-                "that changes them (VecFrameStack, for example)."
-            )
-        wrapper.bind(self._intrinsic_reward)
+        """Bind the bonus to the wrapper in the chain; without a bonus, unbind it, for another model may have been there."""
+        env, wrapper = with_intrinsic_reward(env, self.observation_space, self.intrinsic_reward_scale)
+        if wrapper is not None:
+            wrapper.bind(self._intrinsic_reward if self.intrinsic_reward_scale > 0 else None)
         return env
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        super().set_env(self._bind_intrinsic_reward(self._wrap_env(env, self.verbose)), force_reset)
+        env = self._wrap_env(env, self.verbose)
+        check_for_correct_spaces(env, self.observation_space, self.action_space)
+        before = self.env
+        super().set_env(self._bind_intrinsic_reward(env), force_reset)
+        if before is not None and before is not self.env:  # nobody learns from the old one's bonus any more
+            old = unwrap_vec_wrapper(before, IntrinsicRewardVecEnv)
+            if old is not None and old is not unwrap_vec_wrapper(self.env, IntrinsicRewardVecEnv):  # type: ignore[arg-type]
+                old.bind(None)
+
+    @classmethod
+    def load(
+        cls: type[SelfBisimSAC],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfBisimSAC:
+        """Like SB3's ``load``; ``kwargs`` replace what the model was saved with, and must be arguments that exist."""
+        check_names(BisimSAC, kwargs)
+        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
 
     def _store_transition(
         self, replay_buffer: ReplayBuffer, buffer_action: np.ndarray, new_obs: Any, reward: np.ndarray, *args: Any
@@ -393,45 +387,6 @@ class BisimSAC(SAC):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
-
-    def _check_arguments(self) -> None:
-        """Everything that can be refused before any work starts."""
-        for name in ("bisim_coef", "c_r", "intrinsic_reward_scale", "intrinsic_reward_max", "inverse_dynamics_coef"):
-            _require(np.isfinite(getattr(self, name)) and getattr(self, name) >= 0, self, name, "a finite number >= 0")
-        _require(self.model_coef is None or self.model_coef >= 0, self, "model_coef", "None or a number >= 0")
-        _require(self.c_t is None or 0 <= self.c_t < 1, self, "c_t", "None (gamma) or in [0, 1), else no metric exists")
-        _require(self.c_t is not None or self.gamma < 1, self, "gamma", "below 1 when c_t is None, which stands for gamma")
-        _require(
-            len(self.reward_range) == 2 and -np.inf < self.reward_range[0] < self.reward_range[1] < np.inf,
-            self,
-            "reward_range",
-            "(R_min, R_max), finite, with R_min < R_max",
-        )
-        _require(
-            not self.norm_constraint or self.c_r > 0, self, "c_r", "above 0, or norm_constraint=False: the ball is a point"
-        )
-        _require(self.distance in DISTANCES, self, "distance", f"one of {', '.join(DISTANCES)}")
-        _require(self.dynamics in DYNAMICS, self, "dynamics", f"one of {', '.join(DYNAMICS)}")
-        _require(self.policy_delay >= 1, self, "policy_delay", "an integer >= 1")
-        _require(self.initial_gradient_steps >= 0, self, "initial_gradient_steps", "an integer >= 0")
-
-        n_steps = self.replay_buffer_kwargs.get("n_steps", self.n_steps)
-        buffer_class = self.replay_buffer_class
-        if n_steps != 1 or (buffer_class is not None and issubclass(buffer_class, NStepReplayBuffer)):
-            raise ValueError(
-                f"n_steps={n_steps} (replay_buffer_class={buffer_class}): dynamics, inverse dynamics and metric are about one "
-                "step. Use n_steps=1 and no NStepReplayBuffer."
-            )
-        if self.intrinsic_reward_scale > 0 and buffer_class is not None and issubclass(buffer_class, HerReplayBuffer):
-            raise ValueError(
-                f"intrinsic_reward_scale={self.intrinsic_reward_scale} with HerReplayBuffer: relabelled transitions get the "
-                "environment's reward, without the bonus. Set intrinsic_reward_scale=0."
-            )
-        if not issubclass(self.policy_class, BisimPolicy):
-            raise ValueError(f"policy={self.policy_class}: it must be a subclass of sb3_robust_bisim.policies.BisimPolicy.")
-        extractor = self.policy_kwargs.get("features_extractor_class", MlpEncoder)
-        if self.policy_class is MlpPolicy and extractor is MlpEncoder and is_image_space(self.observation_space):
-            raise ValueError(f'policy="MlpPolicy" with images {self.observation_space}: use "CnnPolicy".')
 
     def save(
         self,
@@ -471,20 +426,5 @@ def _embedding_statistics(z: th.Tensor, radius: float | None) -> dict[str, th.Te
     }
     if radius is not None:
         # projected vectors lie on the surface, up to rounding
-        statistics["bisim/clamp_fraction"] = (norm > radius * (1 - 1e-6)).float().mean()
+        statistics["bisim/clamp_fraction"] = (norm > radius * (1 - 2 * losses.ROUNDING)).float().mean()
     return statistics
-
-
-def _require(condition: bool, model: BisimSAC, name: str, remedy: str) -> None:
-    if not condition:
-        raise ValueError(f"{name}={getattr(model, name)!r}: it must be {remedy}.")
-
-
-def _check_names(kwargs: dict[str, Any]) -> None:
-    """Refuse an argument that neither BisimSAC nor SAC has, for a misspelt key in a config must not train half a method."""
-    known = [*inspect.signature(BisimSAC).parameters, *inspect.signature(SAC).parameters]
-    for name in kwargs:
-        if name not in known:
-            matches = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean {matches[0]!r}?" if matches else "see the documentation of BisimSAC and SAC."
-            raise TypeError(f"BisimSAC has no argument {name!r} (value {kwargs[name]!r}): {hint}")

@@ -1,9 +1,6 @@
 """A replay buffer that stores each frame of a frame-stacked image once and samples what SB3's buffer would sample."""
 
 import copyreg
-import io
-import os
-import pathlib
 import pickle
 import warnings
 import zlib
@@ -16,7 +13,6 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import is_image_space_channels_first
-from stable_baselines3.common.save_util import save_to_pkl
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -328,23 +324,3 @@ def _unpack(block: bytes | bytearray, frames: np.ndarray) -> int:
     if isinstance(block, bytearray):
         block.clear()  # the unpickler holds on to every block until it has read the last: twice the memory otherwise
     return n_frames
-
-
-def save_to_pkl_atomically(path: str | pathlib.Path | io.BufferedIOBase, obj: Any, verbose: int = 0) -> None:
-    """
-    SB3's ``save_to_pkl`` through a temporary file, so that a run stopped while saving leaves the last file whole.
-
-    :param path: Where to write, with ".pkl" appended if it has no suffix; an open file is written to as it is
-    :param obj: What to save
-    :param verbose: Verbosity level
-    """
-    if not isinstance(path, (str, pathlib.Path)):
-        save_to_pkl(path, obj, verbose)
-        return
-    target = pathlib.Path(path) if pathlib.Path(path).suffix else pathlib.Path(f"{path}.pkl")
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-    try:
-        save_to_pkl(temporary, obj, verbose)
-        os.replace(temporary, target)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -5,7 +5,8 @@ from copy import deepcopy
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 BonusFn = Callable[[Any, np.ndarray, Any], np.ndarray]
@@ -74,3 +75,52 @@ def _successors(obs: VecEnvObs, dones: np.ndarray, infos: list[dict[str, Any]]) 
         else:
             obs[i] = terminal  # type: ignore[index]
     return obs
+
+
+def with_intrinsic_reward(
+    env: VecEnv, observation_space: spaces.Space, scale: float
+) -> tuple[VecEnv, IntrinsicRewardVecEnv | None]:
+    """
+    Find the wrapper in a chain, and put one outermost if there is none and one is needed.
+
+    :param env: the chain of the agent
+    :param observation_space: what the agent sees
+    :param scale: weight of the bonus; 0: no wrapper is needed
+    :return: the chain and its wrapper
+    :raises ValueError: if rewards are normalised on the way, if the wrapper's rewards would be ignored, or if it sees
+        other observations than the agent
+    """
+    chain, layer = [], env
+    while isinstance(layer, VecEnvWrapper):
+        chain.append(layer)
+        layer = layer.venv
+    wrapper = next((layer for layer in chain if isinstance(layer, IntrinsicRewardVecEnv)), None)
+    normalize = next((layer for layer in chain if isinstance(layer, VecNormalize)), None)
+    remedy = "use VecNormalize(IntrinsicRewardVecEnv(venv), norm_reward=False)."
+    if normalize is not None and normalize.norm_reward and normalize.training:
+        raise ValueError(
+            "VecNormalize(norm_reward=True): it rescales the rewards while they come in, so that neither the metric nor "
+            "reward_range has a fixed unit. Pass norm_reward=False."
+        )
+    if wrapper is not None and normalize is not None and chain.index(wrapper) < chain.index(normalize):
+        raise ValueError(f"IntrinsicRewardVecEnv outside of VecNormalize: its rewards would be ignored; {remedy}")
+    if scale == 0:
+        return env, wrapper
+    if wrapper is None and normalize is not None:
+        raise ValueError(f"intrinsic_reward_scale={scale} under VecNormalize: {remedy}")
+    if wrapper is None:
+        env = wrapper = IntrinsicRewardVecEnv(env)
+    seen, wanted = _sizes(wrapper.observation_space), _sizes(observation_space)
+    if seen != wanted:
+        raise ValueError(
+            f"IntrinsicRewardVecEnv sees observations of {seen} numbers, the agent of {wanted}: put it outside of the "
+            "wrapper that changes them (VecFrameStack, for example)."
+        )
+    return env, wrapper
+
+
+def _sizes(space: spaces.Space) -> Any:
+    """How many numbers an observation holds, per key: the same before and after a transposition."""
+    if isinstance(space, spaces.Dict):
+        return {key: _sizes(subspace) for key, subspace in space.items()}
+    return int(np.prod(space.shape or ()))

@@ -10,6 +10,7 @@ from torch.nn import functional as F
 
 Distance = Literal["huber", "l1", "l2"]
 DISTANCES: tuple[str, ...] = get_args(Distance)
+ROUNDING = 1e-6  # more than fp32 errs in the norm of an embedding
 
 
 def ball_radius(c_r: float, c_t: float, reward_range: tuple[float, float]) -> float:
@@ -30,13 +31,16 @@ def project_to_ball(x: th.Tensor, radius: float | None) -> th.Tensor:
     """
     Scale the vectors that lie outside the closed L2 ball onto its surface; leave all others bit for bit as they are.
 
+    The surface is meant up to rounding, from the inside: what comes out is never longer than ``radius``.
+
     :param x: (..., n)
     :param radius: None leaves everything as it is
     :return: (..., n)
     """
     if radius is None:
         return x
-    return x / (x.norm(dim=-1, keepdim=True) / radius).clamp(min=1.0)
+    excess = x.norm(dim=-1, keepdim=True) / radius
+    return x / th.where(excess > 1, excess * (1 + ROUNDING), 1.0)
 
 
 def pairwise_distance(x: th.Tensor, y: th.Tensor, distance: str) -> th.Tensor:

@@ -22,7 +22,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize, VecTransposeImage
 
 from sb3_robust_bisim import frame_buffer
-from sb3_robust_bisim.frame_buffer import FrameStackReplayBuffer, save_to_pkl_atomically
+from sb3_robust_bisim.frame_buffer import FrameStackReplayBuffer
 
 ACTION_SPACE = spaces.Box(-1, 1, (2,), dtype=np.float64)
 HEIGHT, WIDTH = 13, 14
@@ -328,22 +328,6 @@ def test_a_buffer_saved_by_sac_goes_on_in_a_new_process_as_if_it_had_not_been_sa
         elsewhere = pool.submit(continue_from_file, str(tmp_path / "buffer.pkl")).result()
     for a, b in zip(elsewhere, continue_and_sample(model), strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-def test_a_failed_save_leaves_the_last_file_whole_and_nothing_else(tmp_path: Path) -> None:
-    save_to_pkl_atomically(tmp_path / "buffer", "first")
-    with pytest.raises((pickle.PicklingError, AttributeError)):
-        save_to_pkl_atomically(tmp_path / "buffer", [bytes(10**6), lambda: None])
-    assert pickle.loads((tmp_path / "buffer.pkl").read_bytes()) == "first"
-    assert [path.name for path in tmp_path.iterdir()] == ["buffer.pkl"]
-
-
-def test_atomic_saving_takes_the_paths_and_files_that_sb3_takes(tmp_path: Path) -> None:
-    save_to_pkl_atomically(str(tmp_path / "new folder" / "buffer.v1"), 1)
-    with open(tmp_path / "open", "wb") as file:
-        save_to_pkl_atomically(file, 2)
-    assert pickle.loads((tmp_path / "new folder" / "buffer.v1").read_bytes()) == 1
-    assert pickle.loads((tmp_path / "open").read_bytes()) == 2
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,11 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
+# Drawing without a GPU or a display; installed where that may be done
+OPENGL         := libegl1 libgl1 libgl1-mesa-dri libosmesa6
+HAS_OPENGL     := import sys; from ctypes.util import find_library as f; sys.exit(not (f('EGL') and f('OSMesa')))
+INSTALL_OPENGL := test "$$(id -u)" = 0 && apt-get -qq update && apt-get -qq install -y $(OPENGL) >/dev/null
+
 .PHONY: help setup train test test-sb3 lint type clean
 .DEFAULT_GOAL := help
 
@@ -14,6 +19,7 @@ setup: $(VENV)/.installed  ## virtual environment with everything in it
 $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet -c constraints.txt -e ".[all]"
+	@$(BIN)/python -c "$(HAS_OPENGL)" || { $(INSTALL_OPENGL); } || echo "Pixel tasks need OpenGL: install $(OPENGL) yourself." >&2
 	touch $@
 
 train: setup  ## the full method on noisy sparse cartpole (two distractors per state dimension)
@@ -42,8 +48,8 @@ lint: setup  ## ruff: style and format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-type: setup  ## mypy
-	$(BIN)/mypy sb3_robust_bisim benchmarks tests
+type: setup  ## mypy: the package is fully typed
+	$(BIN)/mypy sb3_robust_bisim
 
 clean:  ## remove the virtual environment and caches
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

@@ -70,7 +70,7 @@ def test_a_value_out_of_range_is_refused_by_name(name: str, value: Any) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (dict(gamma=1.0), "gamma=1.0: it must be in \[0, 1\) when c_t is None"),
+        (dict(gamma=1.0), r"gamma=1.0: it must be in \[0, 1\) when c_t is None"),
         (dict(c_r=0), "c_r=0: it must be above 0, or norm_constraint=False"),
         (dict(n_steps=3), "n_steps=3 .* Use n_steps=1"),
         (dict(replay_buffer_kwargs=dict(n_steps=3)), "n_steps=3 .* Use n_steps=1"),

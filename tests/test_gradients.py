@@ -1,5 +1,7 @@
 """Who trains what: each loss moves the parameters it should and no others."""
 
+from typing import Any
+
 import pytest
 import torch as th
 from torch import nn
@@ -7,8 +9,8 @@ from torch import nn
 from sb3_robust_bisim import BisimSAC
 
 ENV = "robust_bisim/SparseCartPole-v0"
-EVERYTHING = dict(intrinsic_reward_scale=1.0, inverse_dynamics_coef=1.0)
-SMALL = dict(learning_starts=10, batch_size=16, seed=0, policy_kwargs=dict(net_arch=[16]))
+EVERYTHING: dict[str, Any] = dict(intrinsic_reward_scale=1.0, inverse_dynamics_coef=1.0)
+SMALL: dict[str, Any] = dict(learning_starts=10, batch_size=16, seed=0, policy_kwargs=dict(net_arch=[16]))
 
 
 def trained(**kwargs: object) -> BisimSAC:

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from sb3_robust_bisim import BisimSAC, IntrinsicRewardVecEnv
 
 ENV = "robust_bisim/SparsePendulum-v0"
-SMALL = dict(learning_starts=10, batch_size=8, seed=0, policy_kwargs=dict(net_arch=[16]))
+SMALL: dict[str, Any] = dict(learning_starts=10, batch_size=8, seed=0, policy_kwargs=dict(net_arch=[16]))
 
 
 class Countdown(gym.Env):

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import optuna
@@ -18,7 +19,7 @@ CONFIG = ROOT / "zoo_configs" / "bisim_sac.yml"
 CARTPOLE, PENDULUM, MOUNTAIN_CAR = (
     f"robust_bisim/{name}-v0" for name in ("SparseCartPole", "SparsePendulum", "MountainCarContinuous")
 )
-SAC = dict(bisim_coef=0, norm_constraint=False, intrinsic_reward_scale=0, inverse_dynamics_coef=0)
+SAC: dict[str, Any] = dict(bisim_coef=0, norm_constraint=False, intrinsic_reward_scale=0, inverse_dynamics_coef=0)
 SHORT = ["-n", "120", "-params", "learning_starts:50", "batch_size:16", "initial_gradient_steps:5"]
 
 

@@ -7,6 +7,7 @@ A worker process that has not imported it knows the ids by their long form, as a
 
 from gymnasium import register
 
+from sb3_robust_bisim.envs.dmc import register_suite
 from sb3_robust_bisim.envs.noise import NoiseObservation
 
 __all__ = ["NoiseObservation"]
@@ -20,3 +21,4 @@ register(
     reward_threshold=90.0,
     max_episode_steps=999,
 )
+register_suite()

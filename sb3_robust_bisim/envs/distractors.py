@@ -1,0 +1,269 @@
+"""Pictures that take the place of the background and have nothing to do with the task."""
+
+import copy
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+
+from sb3_robust_bisim.envs.video import SplitClipFiles, check_split, load_clip, split_clips
+
+DISTRACTORS = ("none", "color", "noise", "images", "video", "balls")
+_FROM_FILES = ("images", "video")
+
+
+class Distractor(ABC):
+    """
+    A sequence of background pictures from a random generator of its own: a new one per episode, moved on by one per step of
+    the agent.
+
+    :param size: height and width of the pictures in pixels
+    """
+
+    # Names of the attributes that change while it plays
+    _playing: tuple[str, ...]
+
+    def __init__(self, size: int) -> None:
+        self._shape = (size, size, 3)
+        self._rng = np.random.default_rng()
+
+    def seed(self, seed: int) -> None:
+        """
+        Restart the random generator.
+
+        :param seed: integer >= 0
+        """
+        self._rng = np.random.default_rng(seed)
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Choose the picture that an episode starts with."""
+
+    @abstractmethod
+    def step(self) -> None:
+        """Move on by one step of the agent."""
+
+    @property
+    @abstractmethod
+    def frame(self) -> np.ndarray:
+        """The present picture: uint8 array of shape (size, size, 3), not to be written to."""
+
+    def get_state(self) -> dict[str, Any]:
+        """
+        Read where the sequence stands.
+
+        :return: state for :meth:`set_state`; it can be pickled
+        """
+        playing = {name: copy.deepcopy(getattr(self, name)) for name in self._playing}
+        return {"rng": copy.deepcopy(self._rng.bit_generator.state), **playing}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """
+        Go on exactly from a saved place.
+
+        :param state: what :meth:`get_state` of a distractor with the same arguments returned
+        :raises ValueError: when the state is that of another kind of distractor
+        """
+        if set(state) != {"rng", *self._playing}:
+            raise ValueError(f"state must come from get_state of another {type(self).__name__}, got one with {sorted(state)}")
+        self._rng.bit_generator.state = state["rng"]
+        for name in self._playing:
+            setattr(self, name, copy.deepcopy(state[name]))
+
+
+class ColorDistractor(Distractor):
+    """
+    One colour, drawn uniformly for each episode.
+
+    :param size: height and width of the pictures in pixels
+    """
+
+    _playing = ("_frame",)
+
+    def __init__(self, size: int) -> None:
+        super().__init__(size)
+        self._frame = np.zeros(self._shape, dtype=np.uint8)
+
+    def reset(self) -> None:
+        self._frame = np.broadcast_to(self._rng.integers(0, 256, 3, dtype=np.uint8), self._shape).copy()
+
+    def step(self) -> None:
+        pass
+
+    @property
+    def frame(self) -> np.ndarray:
+        return self._frame
+
+
+class NoiseDistractor(ColorDistractor):
+    """
+    Gaussian noise of mean 127.5 and standard deviation 64 in every channel of every pixel, clipped to [0, 255] and fresh at
+    every step.
+
+    :param size: height and width of the pictures in pixels
+    """
+
+    def reset(self) -> None:
+        noise = self._rng.standard_normal(self._shape, dtype=np.float32)
+        self._frame = np.clip(127.5 + 64.0 * noise, 0, 255).astype(np.uint8)
+
+    def step(self) -> None:
+        self.reset()
+
+
+class ClipDistractor(Distractor):
+    """
+    Video from files: each episode plays a random clip from a random frame on, and begins it again where it ends.
+
+    :param size: height and width of the pictures in pixels
+    :param files: see :func:`~sb3_robust_bisim.envs.video.split_clips`; all of them, of either split, are decoded
+        at once
+    :param split: "train" or "eval": which of the files to play
+    :param moving: False holds the first frame of each episode: still images, which may come from pictures as well
+    :param grayscale: play without colour
+    :param cache_dir: see :func:`~sb3_robust_bisim.envs.video.cache_folder`
+    :raises ValueError: for an argument outside its range, or a file that is missing, empty or broken
+    """
+
+    _playing = ("_clip", "_position")
+
+    def __init__(
+        self,
+        size: int,
+        files: SplitClipFiles | None = None,
+        split: str = "train",
+        *,
+        moving: bool = True,
+        grayscale: bool = False,
+        cache_dir: str | None = None,
+    ) -> None:
+        super().__init__(size)
+        check_split(split)
+        paths = split_clips(files)
+        if not paths[split]:
+            raise ValueError(
+                f"distractor_files holds but the file {str(paths['train'][0])!r}, so none can be held out for split='eval'; "
+                "give a second one, or a mapping {'train': ..., 'eval': ...}"
+            )
+        # Those of the other split too: a broken one should not wait for the evaluation to be found
+        everything = [*paths["train"], *paths["eval"]]
+        clips = {path: load_clip(path, size, grayscale=grayscale, cache_dir=cache_dir) for path in everything}
+        self.paths = paths[split]
+        self._clips = [clips[path] for path in self.paths]
+        self._moving = moving
+        self._clip = 0
+        self._position = 0
+
+    def reset(self) -> None:
+        self._clip = int(self._rng.integers(len(self._clips)))
+        self._position = int(self._rng.integers(len(self._clips[self._clip])))
+
+    def step(self) -> None:
+        if self._moving:
+            self._position = (self._position + 1) % len(self._clips[self._clip])
+
+    @property
+    def frame(self) -> np.ndarray:
+        frame = self._clips[self._clip][self._position]
+        return frame if frame.ndim == 3 else np.broadcast_to(frame[..., None], self._shape)
+
+
+class BallsDistractor(Distractor):
+    """
+    Coloured balls that attract each other and bounce off the edges of the picture (an n-body simulation), in front of black.
+
+    The picture is a unit square. Masses grow with the square of the radius; the balls pass through each other.
+
+    :param size: height and width of the pictures in pixels
+    :param count: number of balls
+    """
+
+    _playing = ("_centers", "_velocities", "_radii", "_colors")
+    _radius_range = (0.06, 0.14)  # in widths of the picture
+    _start_speed = 0.02  # standard deviation of each component, widths per step
+    _gravity = 4e-4  # acceleration of two balls at distance 1, per unit of mass, widths per step^2
+    _softening = 0.1  # distance, in widths, within which the attraction fades, as balls are not points
+
+    def __init__(self, size: int, count: int = 8) -> None:
+        super().__init__(size)
+        self._pixels = (np.arange(size) + 0.5) / size
+        self._centers = np.zeros((count, 2))
+        self._velocities = np.zeros((count, 2))
+        self._radii = np.zeros(count)
+        self._colors = np.zeros((count, 3), dtype=np.uint8)
+
+    def reset(self) -> None:
+        count = len(self._radii)
+        self._radii = self._rng.uniform(*self._radius_range, count)
+        self._centers = self._rng.uniform(self._radii[:, None], 1 - self._radii[:, None], (count, 2))
+        self._velocities = self._rng.normal(0.0, self._start_speed, (count, 2))
+        self._colors = self._rng.integers(48, 256, (count, 3), dtype=np.uint8)
+
+    def step(self) -> None:
+        offsets = self._centers[None] - self._centers[:, None]  # (i, j, xy): from ball i to ball j
+        distances = np.sqrt((offsets**2).sum(-1) + self._softening**2)
+        accelerations = (self._gravity * self._radii**2 / distances**3)[..., None] * offsets
+        self._velocities += accelerations.sum(axis=1)
+        self._centers += self._velocities
+        low, high = self._radii[:, None], 1 - self._radii[:, None]
+        inward = np.where(self._centers < low, 1.0, np.where(self._centers > high, -1.0, 0.0))
+        self._velocities = np.where(inward == 0, self._velocities, inward * np.abs(self._velocities))
+        self._centers = np.clip(self._centers, low, high)
+
+    @property
+    def frame(self) -> np.ndarray:
+        frame = np.zeros(self._shape, dtype=np.uint8)
+        squared = (self._pixels[None, :, None] - self._centers[:, None]) ** 2  # (ball, pixel, xy)
+        inside = squared[:, None, :, 0] + squared[:, :, None, 1] < self._radii[:, None, None] ** 2
+        for ball, color in zip(inside, self._colors, strict=True):
+            frame[ball] = color
+        return frame
+
+
+def check_distractor(name: str, files: SplitClipFiles | None, split: str, grayscale: bool) -> None:
+    """
+    Check the arguments that need no file to be opened.
+
+    :param name: one of "none", "color", "noise", "images", "video" and "balls"
+    :param files: see :class:`ClipDistractor`; only for images and video
+    :param split: "train" or "eval"; without meaning for distractors that take no files
+    :param grayscale: see :class:`ClipDistractor`; only for images and video
+    :raises ValueError: for an argument outside its range, or one that the distractor would ignore
+    """
+    if name not in DISTRACTORS:
+        raise ValueError(f"distractor must be one of {DISTRACTORS}, got {name!r}")
+    check_split(split)
+    if name not in _FROM_FILES:
+        if files is not None:
+            raise ValueError(f"distractor_files is only for the distractors {_FROM_FILES}, got {files!r} for {name!r}")
+        if grayscale:
+            raise ValueError(f"grayscale is only for the distractors {_FROM_FILES}, got {grayscale!r} for {name!r}")
+
+
+def make_distractor(
+    name: str,
+    size: int,
+    files: SplitClipFiles | None = None,
+    split: str = "train",
+    *,
+    grayscale: bool = False,
+    cache_dir: str | None = None,
+) -> Distractor | None:
+    """
+    Build a distractor by its name.
+
+    :param name: one of "none", "color", "noise", "images", "video" and "balls"
+    :param size: height and width of the pictures in pixels
+    :param files: see :class:`ClipDistractor`
+    :param split: "train" or "eval"; without meaning for distractors that take no files
+    :param grayscale: see :class:`ClipDistractor`
+    :param cache_dir: see :class:`ClipDistractor`
+    :return: the distractor; None for "none"
+    :raises ValueError: for an argument outside its range or without meaning for the distractor, or a file that is missing,
+        empty or broken
+    """
+    check_distractor(name, files, split, grayscale)
+    if name in _FROM_FILES:
+        return ClipDistractor(size, files, split, moving=name == "video", grayscale=grayscale, cache_dir=cache_dir)
+    simple = {"color": ColorDistractor, "noise": NoiseDistractor, "balls": BallsDistractor}
+    return simple[name](size) if name in simple else None

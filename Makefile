@@ -8,7 +8,7 @@ OPENGL         := libegl1 libgl1 libgl1-mesa-dri libosmesa6
 HAS_OPENGL     := import sys; from ctypes.util import find_library as f; sys.exit(not (f('EGL') and f('OSMesa')))
 INSTALL_OPENGL := test "$$(id -u)" = 0 && apt-get -qq update && apt-get -qq install -y $(OPENGL) >/dev/null
 
-.PHONY: help setup train test test-sb3 lint type clean
+.PHONY: help setup train train-pixels test test-sb3 lint type clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -25,6 +25,11 @@ $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt
 train: setup  ## the full method on noisy sparse cartpole (two distractors per state dimension)
 	$(BIN)/python -m sb3_robust_bisim train --env robust_bisim/SparseCartPole-v0 --n-timesteps 7000 --seed 0 \
 		--eval-freq 500 --eval-episodes 10 --log-interval 20 --progress --verbose 0 --log-folder logs --tensorboard-log logs/tensorboard
+
+train-pixels: setup  ## a few minutes of cartpole-swingup from pixels with video behind it; ends with a video of the agent
+	$(BIN)/python -m sb3_robust_bisim train --env robust_bisim/cartpole-swingup-pixels-v0 --variant small \
+		--n-timesteps 12000 --seed 0 --eval-freq 4000 --eval-episodes 2 --progress --verbose 0 --log-folder logs \
+		--tensorboard-log logs/tensorboard
 
 test: setup  ## all tests
 	$(BIN)/python -m pytest -n 2

@@ -15,7 +15,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    temporary = target.with_name(f".{target.stem}.{os.getpid()}.tmp{target.suffix}")  # writers choose formats by suffix
     try:
         yield temporary
         os.replace(temporary, target)

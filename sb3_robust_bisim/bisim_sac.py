@@ -322,10 +322,10 @@ class BisimSAC(SAC):
         :param next_obs: true successors
         :return: (n_envs,)
         """
+        both = _concatenate(obs, next_obs)  # one pass of the encoder
         if self._vec_normalize_env is not None:
-            obs, next_obs = self._vec_normalize_env.normalize_obs(obs), self._vec_normalize_env.normalize_obs(next_obs)
-        z = self.critic.encode(self.policy.obs_to_tensor(obs)[0])
-        next_z = self.critic.encode(self.policy.obs_to_tensor(next_obs)[0])
+            both = self._vec_normalize_env.normalize_obs(both)
+        z, next_z = self.critic.encode(self.policy.obs_to_tensor(both)[0]).chunk(2)
         scaled_actions = th.as_tensor(self.policy.scale_action(actions), dtype=th.float32, device=self.device).flatten(1)
         mean, _ = self.policy.dynamics(z, scaled_actions).moments()
         return losses.intrinsic_reward(mean, next_z, self.intrinsic_reward_scale, self.intrinsic_reward_max).cpu().numpy()
@@ -410,6 +410,13 @@ class BisimSAC(SAC):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()
         return [*state_dicts, "policy.inverse_dynamics.optimizer"], tensors
+
+
+def _concatenate(obs: Any, next_obs: Any) -> Any:
+    """Observations of either kind, one batch below the other."""
+    if isinstance(obs, dict):
+        return {key: np.concatenate([obs[key], next_obs[key]]) for key in obs}
+    return np.concatenate([obs, next_obs])
 
 
 def _embedding_statistics(z: th.Tensor, radius: float | None) -> dict[str, th.Tensor]:

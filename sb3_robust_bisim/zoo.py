@@ -16,11 +16,15 @@ from matplotlib.figure import Figure
 from rl_zoo3 import ALGOS
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, convert_offpolicy_params, sample_sac_params
+from rl_zoo3.utils import get_class_by_name
 from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_robust_bisim.atomic import atomic_path
 from sb3_robust_bisim.bisim_sac import BisimSAC
+from sb3_robust_bisim.record import record
 
 ALGO = "bisim_sac"
 DEFAULT_CONFIG = Path("zoo_configs/bisim_sac.yml")
@@ -49,20 +53,23 @@ HYPERPARAMS_SAMPLER[ALGO] = sample_bisim_sac_params
 HYPERPARAMS_CONVERTER[ALGO] = convert_offpolicy_params
 
 
-def variant_settings(config: str | Path, env_id: str, variant: str) -> dict[str, Any]:
+def variant_settings(config: str | Path, env_id: str, *names: str) -> dict[str, Any]:
     """
-    The settings that a named variant of a config file lays over the entry of a task.
+    The settings that named variants of a config file lay over the entry of a task, the last one on top.
 
     :param config: YAML file with a mapping ``variants``, and perhaps another one inside the task's entry
     :param env_id: the task
-    :param variant: name of the method, "DBC" for example
+    :param names: variants, ("DBC",) or ("SAC", "clean", "small") for example
     :raises ValueError: if the file knows no such variant
     """
     content = yaml.safe_load(Path(config).read_text())
-    variants = content.get("variants", {})
-    if variant not in variants:
-        raise ValueError(f"--variant {variant}: {config} has {', '.join(variants) or 'no variants'}.")
-    return {**variants[variant], **content.get(env_id, {}).get("variants", {}).get(variant, {})}
+    general, own = content.get("variants", {}), content.get(env_id, {}).get("variants", {})
+    settings: dict[str, Any] = {}
+    for name in names:
+        if name not in general and name not in own:
+            raise ValueError(f"--variant {name}: for {env_id}, {config} has {', '.join({**general, **own}) or 'no variants'}.")
+        settings |= {**general.get(name, {}), **own.get(name, {})}
+    return settings
 
 
 def check_keys(hyperparams: dict[str, Any], source: str) -> None:
@@ -83,19 +90,21 @@ def check_keys(hyperparams: dict[str, Any], source: str) -> None:
 class BisimExperimentManager(ExperimentManager):
     """The zoo's experiment manager, plus named variants, evaluation in another task, key checks and a report at the end."""
 
-    variant: ClassVar[str | None] = None
+    variants: ClassVar[list[str]] = []
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        # What a config file was written for is not known before it is read: the command line wins over the variant
-        if self.variant is not None:
-            settings = variant_settings(self.config, self.env_name.gym_id, self.variant)
+        if self.variants:  # the command line's own -params win
+            settings = variant_settings(self.config, self.env_name.gym_id, *self.variants)
             self.custom_hyperparams = {**settings, **(self.custom_hyperparams or {})}
         hyperparams, saved_hyperparams = super().read_hyperparameters()
         if self.algo == ALGO:
             check_keys(hyperparams, self.config)
         for settings in (hyperparams, saved_hyperparams):
             settings.pop("variants", None)
-        self.args.variant = self.variant  # kept in the run's args.yml
+        buffer_class = str(hyperparams.get("replay_buffer_class"))
+        if "." in buffer_class:  # the zoo evaluates the string where our classes are unknown
+            hyperparams["replay_buffer_class"] = get_class_by_name(buffer_class)
+        self.args.variant = self.variants  # kept in the run's args.yml
         env_kwargs = self.env_kwargs or hyperparams.get("env_kwargs", {})
         eval_kwargs = hyperparams.pop("eval_env_kwargs", {})
         self.eval_env_kwargs = {**env_kwargs, **eval_kwargs, **(self._eval_env_kwargs_args or {})}
@@ -103,10 +112,22 @@ class BisimExperimentManager(ExperimentManager):
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         super().save_trained_model(model)
-        report(Path(self.save_path), f"{self.env_name} {self.variant or self.algo}")
+        report(Path(self.save_path), f"{self.env_name} {' '.join(self.variants) or self.algo}")
+        if is_image_space(model.observation_space):
+            venv = self._seen_by_the_agent()
+            print("Agent at work: ", *record(model, venv, Path(self.save_path)))
+            venv.close()
         print(f"Model:          {self.save_path}/{self.env_name}.zip")
         if self.tensorboard_log:
             print(f"TensorBoard:    tensorboard --logdir {self.tensorboard_log}")
+
+    def _seen_by_the_agent(self) -> VecEnv:
+        """The evaluation environment, drawing what it shows."""
+        eval_env_kwargs, self.eval_env_kwargs = self.eval_env_kwargs, {**self.eval_env_kwargs, "render_mode": "rgb_array"}
+        try:
+            return self.create_envs(1, eval_env=True)
+        finally:
+            self.eval_env_kwargs = eval_env_kwargs
 
 
 def report(run: Path, title: str) -> None:
@@ -156,7 +177,14 @@ def _train_arguments(arguments: list[str]) -> list[str]:
         allow_abbrev=False,
         description="The zoo's train command, plus:",
     )
-    parser.add_argument("--variant", help="method of the config file, for example SAC, DBC, normed-IR-ID (default: the entry)")
+    parser.add_argument(
+        *("--variant", "--variants"),
+        dest="variants",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="variants of the config file to lay over the task's entry, for example DBC, or SAC clean small",
+    )
     parser.add_argument("--algo", default=ALGO, help="RL algorithm (default: %(default)s)")
     parser.add_argument(
         "-conf", "--conf-file", help=f"hyperparameters (default: {DEFAULT_CONFIG} for {ALGO}, if that file is here)"
@@ -165,7 +193,7 @@ def _train_arguments(arguments: list[str]) -> list[str]:
         parser.print_help()
         print()
     ours, theirs = parser.parse_known_args(arguments)
-    BisimExperimentManager.variant = ours.variant
+    BisimExperimentManager.variants = ours.variants
     config = ours.conf_file or (str(DEFAULT_CONFIG) if ours.algo == ALGO and DEFAULT_CONFIG.is_file() else None)
     if ours.algo == ALGO and config is None and not {"-h", "--help"} & set(arguments):
         parser.error(f"-conf is needed: {DEFAULT_CONFIG} is not in this folder.")

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER
 
-from sb3_robust_bisim import BisimSAC
+from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer
 from sb3_robust_bisim.zoo import check_keys, main, sample_bisim_sac_params, variant_settings
 
 ROOT = Path(__file__).parent.parent
@@ -86,7 +86,7 @@ def test_train_evaluates_in_the_standard_task_and_reports_and_resumes_and_plays(
     assert f"{evaluations['results'][-1].mean():.1f} at step 120" in output
     assert (run / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
     folder = run / "robust_bisim-SparseCartPole-v0"
-    assert yaml.unsafe_load((folder / "args.yml").read_text())["variant"] == "normed-ID"
+    assert yaml.unsafe_load((folder / "args.yml").read_text())["variant"] == ["normed-ID"]
     model = BisimSAC.load(run / "robust_bisim-SparseCartPole-v0.zip")
     assert (model.intrinsic_reward_scale, model.inverse_dynamics_coef, model.batch_size) == (0.0, 1.0, 16)
     assert model.observation_space.shape == (12,)  # noise_multiplier: 2 from the config
@@ -97,6 +97,38 @@ def test_train_evaluates_in_the_standard_task_and_reports_and_resumes_and_plays(
     assert (tmp_path / "bisim_sac" / "robust_bisim-SparseCartPole-v0_2" / "robust_bisim-SparseCartPole-v0.zip").exists()
     played = zoo("enjoy", "--env", CARTPOLE, "-f", str(tmp_path), "--exp-id", "1", "-n", "30", "--no-render")
     assert "Episode Reward" in played or "Loading" in played
+
+
+def test_variants_are_laid_over_each_other() -> None:
+    pixels = "robust_bisim/cheetah-run-pixels-v0"
+    settings = variant_settings(CONFIG, pixels, "SAC", "clean", "small")
+    assert settings.items() >= {**SAC, "batch_size": 128, "bf16": True}.items()
+    assert settings["env_kwargs"]["distractor"] == "none"
+    with pytest.raises(ValueError, match="--variant small: for robust_bisim/SparseCartPole-v0"):
+        variant_settings(CONFIG, CARTPOLE, "small")  # known to the pixel tasks alone
+
+
+def test_training_from_pixels_ends_with_a_video_and_what_the_agent_sees(zoo: Zoo, tmp_path: Path) -> None:
+    pytest.importorskip("dm_control")
+    import imageio.v2 as imageio
+
+    output = zoo(
+        *("train", "--env", "robust_bisim/cartpole-swingup-pixels-v0", "--variant", "small", "-n", "40", "--eval-freq", "20"),
+        *("--env-kwargs", "distractor:'video'", "action_repeat:50", "--eval-episodes", "1", "-f", str(tmp_path)),
+        *("-params", "learning_starts:20", "batch_size:4", "buffer_size:60", "n_envs:2"),
+    )
+    run = tmp_path / "bisim_sac" / "robust_bisim-cartpole-swingup-pixels-v0_1"
+    assert str(run / "agent.mp4") in output
+    video = imageio.get_reader(run / "agent.mp4")
+    assert video.count_frames() == 20
+    frame = video.get_data(10)
+    assert frame.shape == (256, 256, 3)
+    assert frame.std() > 20  # there is something to be seen
+    assert imageio.imread(run / "what_the_agent_sees.png").shape == (3 * 84, 8 * 84, 3)
+    model = BisimSAC.load(run / "robust_bisim-cartpole-swingup-pixels-v0.zip")
+    assert model.bf16
+    assert model.replay_buffer_class is FrameStackReplayBuffer
+    assert model.observation_space.shape == (9, 84, 84)
 
 
 def test_env_kwargs_of_the_command_line_reach_training_and_evaluation(zoo: Zoo, tmp_path: Path) -> None:

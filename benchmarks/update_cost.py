@@ -1,0 +1,237 @@
+"""
+What does a gradient step cost, beside SB3's SAC and beside the matrix products that it cannot do without?
+
+Arms: SB3's SAC (fp32, same encoder class, widths and batch), BisimSAC with everything on (metric, norm, dynamics, reward,
+bonus, inverse), the same with PyTorch's default matrix product in place of oneDNN's (`full_mkl`, see fast_paths.py), BisimSAC
+with everything off, and the floor: the full method's matrix products and convolutions alone, with the default product. Each
+with the actor every 2nd update (`paper`) and every update (`sac`), in fp32 and with bf16=True. All arms are interleaved in
+one process, one thread; peak memory is that of a process per arm. The last line printed is one JSON object.
+"""
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from unittest import mock
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from _machine import machine
+from stable_baselines3 import SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.env_util import make_vec_env
+from torch.nn import functional as F
+from tqdm import tqdm
+
+from sb3_robust_bisim import BisimSAC, IntrinsicRewardVecEnv, bisim_sac
+from sb3_robust_bisim.encoders import MlpEncoder, PixelEncoder
+
+BATCH = {"mlp": 512, "cnn": 128}
+SCHEDULE = {"paper": dict(policy_delay=2, target_update_interval=2), "sac": dict(policy_delay=1)}
+FULL = dict(intrinsic_reward_scale=2.0, inverse_dynamics_coef=1.0)
+OFF = dict(bisim_coef=0.0, norm_constraint=False)
+CARTPOLE = "robust_bisim/SparseCartPole-v0"
+
+
+class RandomPixels(gym.Env):
+    """Three stacked RGB frames of noise: what an update costs does not depend on what is to be seen."""
+
+    observation_space = gym.spaces.Box(0, 255, (9, 84, 84), np.uint8)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        return self.np_random.integers(0, 256, (9, 84, 84), dtype=np.uint8), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        obs, _ = self.reset()
+        return obs, 0.5, False, False, {}
+
+
+def build(kind: str, arm: str, schedule: str, bf16: bool) -> BaseAlgorithm:
+    """A model with a filled buffer whose next call is `train`."""
+    env = gym.make(CARTPOLE, noise_multiplier=1) if kind == "mlp" else RandomPixels()
+    encoder = MlpEncoder if kind == "mlp" else PixelEncoder
+    common = dict(seed=0, buffer_size=1000, learning_starts=10**9, learning_rate=1e-3)
+    policy = "MlpPolicy" if kind == "mlp" else "CnnPolicy"
+    policy_kwargs = dict(
+        net_arch=[256, 256], features_extractor_class=encoder, features_extractor_kwargs=dict(features_dim=50)
+    )
+    if arm == "sb3_sac":
+        model: BaseAlgorithm = SAC(policy, env, policy_kwargs=policy_kwargs, **common)
+    else:
+        extras = {**(FULL if arm == "full" else OFF), **SCHEDULE[schedule]}
+        model = BisimSAC(policy, env, policy_kwargs=policy_kwargs, bf16=bf16, **extras, **common)
+    return model.learn(2 * BATCH[kind])
+
+
+def floor(kind: str, schedule: str, bf16: bool) -> Callable[[], None]:
+    """The full method's matrix products and convolutions, forward and backward, and nothing else."""
+    batch, passes = BATCH[kind], []
+
+    def linear(n_in: int, n_out: int, forward: float, weight: float, inputs: float, dtype: th.dtype = th.float32) -> None:
+        x, w, y = th.randn(batch, n_in).to(dtype), th.randn(n_in, n_out).to(dtype), th.randn(batch, n_out).to(dtype)
+        for count, left, right in ((forward, x, w), (weight, x.T, y), (inputs, y, w.T)):
+            passes.append((count, left.mm, right))
+
+    every = 1 / SCHEDULE[schedule]["policy_delay"]
+    encoder_dtype = th.bfloat16 if bf16 else th.float32
+    if kind == "mlp":
+        # three forward passes (s, s', s' by the target), two backward
+        linear(8, 50, 3, 2, 0, encoder_dtype)
+        linear(50, 50, 6, 4, 4, encoder_dtype)
+    else:
+        x = th.rand(batch, 9, 84, 84).to(encoder_dtype)
+        w1, w2 = (th.randn(*shape).to(encoder_dtype) for shape in ((32, 9, 3, 3), (32, 32, 3, 3)))
+        h = F.conv2d(x, w1, stride=2)
+        y = F.conv2d(h, w2)
+        passes.append((3, lambda w: F.conv2d(x, w, stride=2), w1))
+        passes.append((3, lambda w: F.conv2d(h, w), w2))
+        geometry = ([0, 0], [1, 1], False, [0, 0], 1)
+        backward = th.ops.aten.convolution_backward
+        passes.append((2, lambda w: backward(h, x, w, [32], [2, 2], *geometry, [False, True, True]), w1))
+        passes.append((2, lambda w: backward(y, h, w, [32], [1, 1], *geometry, [True, True, True]), w2))
+        linear(int(np.prod(y.shape[1:])), 50, 3, 2, 2, encoder_dtype)
+    # two critics: the TD error forward and backward, the target forward, the actor loss forward and back to the action
+    for n_in, n_out in ((51, 256), (256, 256), (256, 1)):
+        linear(n_in, n_out, 2 * (2 + every), 2, 2 * (1 + every))
+    # actor: on s' forward; its loss forward and backward, though not into z
+    for n_in, n_out in ((50, 256), (256, 256), (256, 2)):
+        linear(n_in, n_out, 1 + every, every, every if n_in > 50 else 0)
+    for n_in, n_out in ((51, 512), (512, 50), (50, 512), (512, 1), (100, 256), (256, 128), (128, 1)):  # the three models
+        linear(n_in, n_out, 1, 1, 1)
+    debts = [0.0] * len(passes)
+
+    def run() -> None:
+        for i, (count, product, operand) in enumerate(passes):
+            debts[i] += count
+            while debts[i] >= 1:
+                debts[i] -= 1
+                product(operand)
+
+    return run
+
+
+def peak_memory(kind: str, arm: str, schedule: str, bf16: bool) -> float:
+    """MiB that two updates need at most, the process with its imports and the buffer included."""
+    model = build(kind, arm, schedule, bf16)
+    model.train(2, BATCH[kind])
+    # not getrusage: its peak is the parent's where that one's was higher
+    status = Path("/proc/self/status").read_text()
+    return int(status.split("VmHWM:")[1].split()[0]) / 1024
+
+
+def update_times(kind: str, rounds: int, per_round: int) -> dict[str, dict]:
+    def trainer(arm: str, schedule: str, bf16: bool) -> Callable[[], None]:
+        model = build(kind, arm, schedule, bf16)
+        return lambda: model.train(per_round, BATCH[kind])
+
+    def repeated(run: Callable[[], None]) -> Callable[[], None]:
+        return lambda: [run() for _ in range(per_round)] and None
+
+    def with_default_product(run: Callable[[], None]) -> Callable[[], None]:
+        def patched() -> None:
+            with mock.patch.object(bisim_sac, "exact_onednn_matmul", lambda device: nullcontext()):
+                run()
+
+        return patched
+
+    arms = {("sb3_sac", "sac", False): trainer("sb3_sac", "sac", False)}
+    for schedule in SCHEDULE:
+        for bf16 in (False, True):
+            arms.update({(arm, schedule, bf16): trainer(arm, schedule, bf16) for arm in ("full", "off")})
+            arms[("full_mkl", schedule, bf16)] = with_default_product(arms[("full", schedule, bf16)])
+            arms[("floor", schedule, bf16)] = repeated(floor(kind, schedule, bf16))
+    times: dict[tuple, list[float]] = {key: [] for key in arms}
+    for round_number in tqdm(range(rounds + 1), desc=f"{kind} updates", file=sys.stderr):
+        for key, run in arms.items():
+            started = time.perf_counter()
+            run()
+            if round_number > 0:  # the first one warms up
+                times[key].append(1000 * (time.perf_counter() - started) / per_round)
+    with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
+        memory = dict(
+            zip(arms, pool.starmap(peak_memory, [(kind, *key) for key in arms if key[0] != "floor"], 1), strict=False)
+        )
+    result: dict[str, dict] = {}
+    for bf16 in (False, True):
+        for schedule in SCHEDULE:
+            keys = {"sb3_sac": ("sb3_sac", "sac", False)} | {
+                arm: (arm, schedule, bf16) for arm in ("full", "full_mkl", "off", "floor")
+            }
+            entry: dict[str, float | list[float]] = {}
+            for arm, key in keys.items():
+                entry[f"{arm}_ms"] = round(float(np.median(times[key])), 3)
+                entry[f"{arm}_ms_quartiles"] = np.percentile(times[key], [25, 75]).round(3).tolist()
+                if key in memory:
+                    entry[f"{arm}_peak_mib"] = round(memory[key])
+            # the ratio of each round, so that a slow spell of the machine strikes both sides
+            for other in ("sac", "floor"):
+                key = keys["sb3_sac" if other == "sac" else other]
+                for arm in ("full", "full_mkl"):
+                    entry[f"{arm}_over_{other}"] = round(float(np.median(np.divide(times[keys[arm]], times[key]))), 3)
+            result.setdefault("bf16" if bf16 else "fp32", {})[schedule] = entry
+    return result
+
+
+def bonus_cost(env_id: str, n_envs: int, steps: int) -> dict[str, float]:
+    """Time of environment step plus policy call, with the bonus bound over unbound, interleaved."""
+    venv = IntrinsicRewardVecEnv(make_vec_env(env_id, n_envs, env_kwargs=dict(noise_multiplier=2), seed=0))
+    model = BisimSAC("MlpPolicy", venv, seed=0, buffer_size=1000, **FULL)
+    obs, times = venv.reset(), {True: [], False: []}
+    for step in range(2 * steps):
+        bound = step % 2 == 0
+        venv.bind(model._intrinsic_reward if bound else None)
+        started = time.perf_counter()
+        actions, _ = model.predict(obs)  # type: ignore[arg-type]
+        obs, *_ = venv.step(actions)
+        times[bound].append(1000 * (time.perf_counter() - started))
+    with_bonus, without = (float(np.median(times[bound])) for bound in (True, False))
+    return {"n_envs": n_envs, "with_ms": with_bonus, "without_ms": without, "ratio": with_bonus / without}
+
+
+def learn_cost(steps: int) -> dict[str, float]:
+    """Time of a step of `learn()` on noisy cartpole over the time of its update."""
+    settings = dict(seed=0, buffer_size=50_000, batch_size=512, learning_starts=1000, learning_rate=1e-3)
+    model = BisimSAC("MlpPolicy", gym.make(CARTPOLE, noise_multiplier=2), **FULL, **SCHEDULE["paper"], **settings)
+    model.learn(1000)
+    updates: list[float] = []
+    train = model.train
+
+    def timed_train(*args: int, **kwargs: int) -> None:
+        started = time.perf_counter()
+        train(*args, **kwargs)
+        updates.append(time.perf_counter() - started)
+
+    model.train = timed_train  # type: ignore[method-assign]
+    started = time.perf_counter()
+    model.learn(steps, reset_num_timesteps=False)
+    seconds = time.perf_counter() - started
+    return {"step_ms": 1000 * seconds / steps, "update_ms": 1000 * sum(updates) / steps, "ratio": seconds / sum(updates)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=30, help="timed rounds over all arms, mlp (default: %(default)s)")
+    parser.add_argument("--cnn-rounds", type=int, default=10, help="the same for cnn; 0 leaves it out (default: %(default)s)")
+    args = parser.parse_args()
+    th.set_num_threads(1)
+    result: dict = {"benchmark": "update_cost", **machine(), "batch": BATCH}
+    result["mlp"] = update_times("mlp", args.rounds, per_round=4)
+    if args.cnn_rounds:
+        result["cnn"] = update_times("cnn", args.cnn_rounds, per_round=2)
+    result["bonus"] = {env_id: bonus_cost(env_id, 16, 300) for env_id in (CARTPOLE, "robust_bisim/cheetah-run-v0")}
+    result["learn"] = learn_cost(500)
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()

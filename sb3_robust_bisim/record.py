@@ -1,0 +1,52 @@
+"""Pictures of an agent at work from pixels: a video for people, and a contact sheet of what the agent itself sees."""
+
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_robust_bisim.atomic import atomic_path
+
+COLUMNS, ROWS = 8, 4
+
+
+def record(model: BaseAlgorithm, venv: VecEnv, folder: Path) -> tuple[Path, Path]:
+    """
+    Play one episode without exploration.
+
+    :param model: acts on stacks of RGB frames
+    :param venv: one environment with ``render_mode="rgb_array"``, in the agent's chain of wrappers
+    :param folder: where ``agent.mp4`` and ``what_the_agent_sees.png`` are put
+    :return: the two files
+    """
+    shown, seen, done = [], [], False
+    obs = venv.reset()
+    while not done:
+        shown.append(venv.render())
+        seen.append(_newest_frame(np.asarray(obs)[0]))
+        action, _ = model.predict(obs, deterministic=True)  # type: ignore[arg-type]
+        obs, _, dones, _ = venv.step(action)
+        done = bool(dones[0])
+    with atomic_path(folder / "agent.mp4") as temporary:
+        imageio.mimwrite(temporary, shown, format="FFMPEG", fps=25, macro_block_size=2)  # type: ignore[arg-type]
+    with atomic_path(folder / "what_the_agent_sees.png") as temporary:
+        imageio.imwrite(temporary, contact_sheet(seen), format="PNG-PIL")
+    return folder / "agent.mp4", folder / "what_the_agent_sees.png"
+
+
+def contact_sheet(frames: list[np.ndarray]) -> np.ndarray:
+    """Frames of one episode, (H, W, 3) each and evenly spaced in time, as one picture of 8 columns and up to 4 rows."""
+    picked = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, COLUMNS * ROWS).astype(int))]
+    blank = np.full_like(frames[0], 255)
+    picked += [blank] * (-len(picked) % COLUMNS)
+    rows = [np.concatenate(picked[i : i + COLUMNS], axis=1) for i in range(0, len(picked), COLUMNS)]
+    return np.concatenate(rows)
+
+
+def _newest_frame(stack: np.ndarray) -> np.ndarray:
+    """The last RGB frame of a stack of either channel order, (H, W, 3)."""
+    if stack.shape[0] < stack.shape[-1]:
+        stack = stack.transpose(1, 2, 0)
+    return stack[..., -3:]

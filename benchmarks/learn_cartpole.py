@@ -9,8 +9,6 @@ line printed is one JSON object.
 import argparse
 import json
 import os
-import platform
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -20,16 +18,16 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # runs are spread over processes,
 import gymnasium as gym
 import joblib
 import numpy as np
-import stable_baselines3
 import torch as th
 import yaml
+from _machine import machine
 from matplotlib.figure import Figure
+from rl_zoo3.utils import StoreDict
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from tqdm import tqdm
 
-import sb3_robust_bisim
 from sb3_robust_bisim import BisimSAC
 from sb3_robust_bisim.atomic import atomic_path
 from sb3_robust_bisim.zoo import ZOO_KEYS, variant_settings
@@ -71,13 +69,12 @@ def write(run: dict, path: Path) -> None:
         temporary.write_text(json.dumps(run, indent=1))
 
 
-def train(method: str, seed: int, steps: int, noise: int, burst: int | None, path: Path) -> dict:
+def train(method: str, seed: int, steps: int, noise: int, overrides: dict, path: Path) -> dict:
     if path.exists() and json.loads(path.read_text())["finished"]:
         return json.loads(path.read_text())
     th.set_num_threads(1)
     settings = {**yaml.safe_load(CONFIG.read_text())[ENV_ID], **variant_settings(CONFIG, ENV_ID, method)}
-    if burst is not None:
-        settings["initial_gradient_steps"] = burst
+    settings |= overrides
     run = {"method": method, "seed": seed, "noise_multiplier": noise, **machine(), "finished": False, "evaluations": []}
     run["arguments"] = {key: value for key, value in settings.items() if key not in ZOO_KEYS}
     eval_env = Monitor(gym.make(ENV_ID, noise_multiplier=noise, **settings["eval_env_kwargs"]))
@@ -91,20 +88,6 @@ def train(method: str, seed: int, steps: int, noise: int, burst: int | None, pat
     run["finished"] = True
     write(run, path)
     return run
-
-
-def machine() -> dict:
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout.strip()
-    return {
-        "commit": commit or "unknown",
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores, one thread per run",
-        "versions": {
-            "python": platform.python_version(),
-            "torch": th.__version__,
-            "stable_baselines3": stable_baselines3.__version__,
-            "sb3_robust_bisim": sb3_robust_bisim.__version__,
-        },
-    }
 
 
 def summary(runs: list[dict]) -> dict:
@@ -156,14 +139,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--steps", type=int, default=10_000)
     parser.add_argument("--noise-multiplier", type=int, default=2, help="N_m, distractors per state dimension")
-    parser.add_argument("--initial-gradient-steps", type=int, help="replaces the config's burst (0: none)")
+    parser.add_argument("--params", nargs="+", action=StoreDict, default={}, help="overrides, e.g. initial_gradient_steps:0")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "learn_cartpole")
     args = parser.parse_args()
     todo = [(method, seed) for seed in range(args.seeds) for method in args.methods]
     tasks = [
         joblib.delayed(train)(
-            *(method, seed, args.steps, args.noise_multiplier, args.initial_gradient_steps),
+            *(method, seed, args.steps, args.noise_multiplier, args.params),
             args.out / f"{method}_seed{seed}.json",
         )
         for method, seed in todo

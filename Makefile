@@ -8,7 +8,7 @@ OPENGL         := libegl1 libgl1 libgl1-mesa-dri libosmesa6
 HAS_OPENGL     := import sys; from ctypes.util import find_library as f; sys.exit(not (f('EGL') and f('OSMesa')))
 INSTALL_OPENGL := test "$$(id -u)" = 0 && apt-get -qq update && apt-get -qq install -y $(OPENGL) >/dev/null
 
-.PHONY: help setup train train-pixels test test-sb3 lint type clean
+.PHONY: help setup train train-pixels test test-sb3 lint type docs clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -55,6 +55,9 @@ lint: setup  ## ruff: style and format
 
 type: setup  ## mypy: the package is fully typed
 	$(BIN)/mypy sb3_robust_bisim
+
+docs: setup  ## HTML documentation in docs/_build
+	$(BIN)/python -m sphinx -q -b html docs docs/_build
 
 clean:  ## remove the virtual environment and caches
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

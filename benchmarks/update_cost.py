@@ -9,6 +9,7 @@ one process, one thread; peak memory is that of a process per arm. The last line
 """
 
 import argparse
+import itertools
 import json
 import multiprocessing
 import os
@@ -129,56 +130,72 @@ def peak_memory(kind: str, arm: str, schedule: str, bf16: bool) -> float:
     return int(status.split("VmHWM:")[1].split()[0]) / 1024
 
 
-def update_times(kind: str, rounds: int, per_round: int) -> dict[str, dict]:
-    def trainer(arm: str, schedule: str, bf16: bool) -> Callable[[], None]:
-        model = build(kind, arm, schedule, bf16)
-        return lambda: model.train(per_round, BATCH[kind])
+Arm = tuple[str, str, bool]  # name, schedule, bf16
+SB3_SAC: Arm = ("sb3_sac", "sac", False)
 
-    def repeated(run: Callable[[], None]) -> Callable[[], None]:
-        return lambda: [run() for _ in range(per_round)] and None
+
+def build_arms(kind: str, per_round: int) -> dict[Arm, Callable[[], None]]:
+    """For each arm a function that does ``per_round`` updates."""
+
+    def trainer(arm: Arm) -> Callable[[], None]:
+        model = build(kind, *arm)
+        return lambda: model.train(per_round, BATCH[kind])
 
     def with_default_product(run: Callable[[], None]) -> Callable[[], None]:
         def patched() -> None:
-            with mock.patch.object(bisim_sac, "exact_onednn_matmul", lambda device: nullcontext()):
+            with mock.patch.object(bisim_sac, "exact_onednn_matmul", return_value=nullcontext()):
                 run()
 
         return patched
 
-    arms = {("sb3_sac", "sac", False): trainer("sb3_sac", "sac", False)}
-    for schedule in SCHEDULE:
-        for bf16 in (False, True):
-            arms.update({(arm, schedule, bf16): trainer(arm, schedule, bf16) for arm in ("full", "off")})
-            arms[("full_mkl", schedule, bf16)] = with_default_product(arms[("full", schedule, bf16)])
-            arms[("floor", schedule, bf16)] = repeated(floor(kind, schedule, bf16))
-    times: dict[tuple, list[float]] = {key: [] for key in arms}
+    def repeated(run: Callable[[], None]) -> Callable[[], None]:
+        def repeat() -> None:
+            for _ in range(per_round):
+                run()
+
+        return repeat
+
+    arms = {SB3_SAC: trainer(SB3_SAC)}
+    for schedule, bf16 in itertools.product(SCHEDULE, (False, True)):
+        arms |= {(name, schedule, bf16): trainer((name, schedule, bf16)) for name in ("full", "off")}
+        arms["full_mkl", schedule, bf16] = with_default_product(arms["full", schedule, bf16])
+        arms["floor", schedule, bf16] = repeated(floor(kind, schedule, bf16))
+    return arms
+
+
+def time_arms(kind: str, rounds: int, per_round: int) -> dict[Arm, list[float]]:
+    """Milliseconds per update of each arm, one number per round; in a round all arms follow each other."""
+    arms = build_arms(kind, per_round)
+    times: dict[Arm, list[float]] = {arm: [] for arm in arms}
     for round_number in tqdm(range(rounds + 1), desc=f"{kind} updates", file=sys.stderr):
-        for key, run in arms.items():
+        for arm, run in arms.items():
             started = time.perf_counter()
             run()
             if round_number > 0:  # the first one warms up
-                times[key].append(1000 * (time.perf_counter() - started) / per_round)
+                times[arm].append(1000 * (time.perf_counter() - started) / per_round)
+    return times
+
+
+def update_times(kind: str, rounds: int, per_round: int) -> dict[str, dict]:
+    times = time_arms(kind, rounds, per_round)
+    models = [arm for arm in times if arm[0] in ("sb3_sac", "full", "off")]
     with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
-        memory = dict(
-            zip(arms, pool.starmap(peak_memory, [(kind, *key) for key in arms if key[0] != "floor"], 1), strict=False)
-        )
-    result: dict[str, dict] = {}
-    for bf16 in (False, True):
-        for schedule in SCHEDULE:
-            keys = {"sb3_sac": ("sb3_sac", "sac", False)} | {
-                arm: (arm, schedule, bf16) for arm in ("full", "full_mkl", "off", "floor")
-            }
-            entry: dict[str, float | list[float]] = {}
-            for arm, key in keys.items():
-                entry[f"{arm}_ms"] = round(float(np.median(times[key])), 3)
-                entry[f"{arm}_ms_quartiles"] = np.percentile(times[key], [25, 75]).round(3).tolist()
-                if key in memory:
-                    entry[f"{arm}_peak_mib"] = round(memory[key])
+        memory = dict(zip(models, pool.starmap(peak_memory, [(kind, *arm) for arm in models], 1), strict=True))
+    result: dict[str, dict] = {"fp32": {}, "bf16": {}}
+    for schedule, bf16 in itertools.product(SCHEDULE, (False, True)):
+        entry: dict[str, float | list[float]] = {}
+        for name in ("sb3_sac", "full", "full_mkl", "off", "floor"):
+            arm = SB3_SAC if name == "sb3_sac" else (name, schedule, bf16)
+            entry[f"{name}_ms"] = round(float(np.median(times[arm])), 3)
+            entry[f"{name}_ms_quartiles"] = np.percentile(times[arm], [25, 75]).round(3).tolist()
+            if arm in memory:
+                entry[f"{name}_peak_mib"] = round(memory[arm])
             # the ratio of each round, so that a slow spell of the machine strikes both sides
-            for other in ("sac", "floor"):
-                key = keys["sb3_sac" if other == "sac" else other]
-                for arm in ("full", "full_mkl"):
-                    entry[f"{arm}_over_{other}"] = round(float(np.median(np.divide(times[keys[arm]], times[key]))), 3)
-            result.setdefault("bf16" if bf16 else "fp32", {})[schedule] = entry
+            if name.startswith("full"):
+                for other, beside in (("sac", SB3_SAC), ("floor", ("floor", schedule, bf16))):
+                    ratios = np.divide(times[arm], times[beside])
+                    entry[f"{name}_over_{other}"] = round(float(np.median(ratios)), 3)
+        result["bf16" if bf16 else "fp32"][schedule] = entry
     return result
 
 

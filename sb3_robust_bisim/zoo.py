@@ -112,7 +112,8 @@ class BisimExperimentManager(ExperimentManager):
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         super().save_trained_model(model)
-        report(Path(self.save_path), f"{self.env_name} {' '.join(self.variants) or self.algo}")
+        title = f"{self.env_name} {' '.join(self.variants) or self.algo}"
+        report(Path(self.save_path), title, learning_starts=getattr(model, "learning_starts", 0))
         if is_image_space(model.observation_space):
             venv = self._seen_by_the_agent()
             print("Agent at work: ", *record(model, venv, Path(self.save_path)))
@@ -130,12 +131,13 @@ class BisimExperimentManager(ExperimentManager):
             self.eval_env_kwargs = eval_env_kwargs
 
 
-def report(run: Path, title: str) -> None:
+def report(run: Path, title: str, learning_starts: int) -> None:
     """
     Draw the learning curve of a run and print where it began and where it ended.
 
     :param run: folder with the ``evaluations.npz`` of SB3's EvalCallback; without one there is nothing to report
     :param title: of the picture
+    :param learning_starts: steps before which nothing was learned
     """
     if not (run / "evaluations.npz").exists():
         return
@@ -150,8 +152,9 @@ def report(run: Path, title: str) -> None:
     axes.grid(alpha=0.3)
     with atomic_path(run / "learning_curve.png") as temporary:
         figure.savefig(temporary, dpi=120, format="png")
-    print(f"Evaluation return (mean of {returns.shape[1]} episodes): {mean[0]:.1f} at step {steps[0]}", end=", ")
-    print(f"{mean[-1]:.1f} at step {steps[-1]}")
+    print(f"Evaluation return, mean of {returns.shape[1]} episodes:")
+    print(f"  {'before training' if steps[0] <= learning_starts else 'at first'} (step {steps[0]}): {mean[0]:.1f}")
+    print(f"  after training (step {steps[-1]}): {mean[-1]:.1f}")
     print(f"Learning curve: {run / 'learning_curve.png'}")
 
 

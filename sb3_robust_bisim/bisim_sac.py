@@ -43,8 +43,8 @@ class BisimSAC(SAC):
     :param bisim_coef: weight of the metric loss (eq:general-bisim-loss), >= 0; 0 turns it off
     :param c_r: c_R, weight of the reward gap in the metric, >= 0
     :param c_t: c_T, weight of the transition term, in [0, 1). None: ``gamma``
-    :param reward_range: (R_min, R_max) of one agent step, as the agent sees it: action repeat sums rewards. It sets the
-        radius of the norm constraint
+    :param reward_range: (R_min, R_max) of one agent step: action repeat sums rewards. It sets the radius of the norm
+        constraint. The bonus is not counted, and the paper takes (0, 1) for all its tasks
     :param norm_constraint: hold embeddings and predictions in the ball of eq:constraint, with radius
         c_R (R_max - R_min) / (2 (1 - c_T))
     :param distance: "huber" (elementwise, the paper's experiments), "l1" or "l2" (norms of the whole embedding);
@@ -293,20 +293,21 @@ class BisimSAC(SAC):
         :param scalars: for each TensorBoard key the numbers of the updates that gave a value, and the values
         :raises ValueError: if one of them is not finite
         """
-        flat = th.stack([value for steps in scalars.values() for _, value in steps]).cpu().tolist()
-        values = iter(flat)
+        values = iter(th.stack([value for steps in scalars.values() for _, value in steps]).cpu().tolist())
+        numbers = {name: [(update, next(values)) for update, _ in steps] for name, steps in scalars.items()}
+        broken = [
+            (update, name, value) for name, steps in numbers.items() for update, value in steps if not np.isfinite(value)
+        ]
+        if broken:
+            update, name, value = min(broken, key=lambda entry: entry[0])  # later ones follow from it
+            raise ValueError(
+                f"{name} became {value} at update {update}: training has stopped. Load the last checkpoint, and lower "
+                "learning_rate, set norm_constraint=True or check the range of observations and rewards."
+            )
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        means = {}
-        for name, steps in scalars.items():
-            of_name = [next(values) for _ in steps]
-            for (update, _), value in zip(steps, of_name, strict=True):
-                if not np.isfinite(value):
-                    raise ValueError(
-                        f"{name} became {value} at update {update}: training has stopped. Load the last checkpoint, and lower "
-                        "learning_rate, set norm_constraint=True or check the range of observations and rewards."
-                    )
-            means[name] = float(np.mean(of_name))
-            self.logger.record(name, means[name])
+        means = {name: float(np.mean([value for _, value in steps])) for name, steps in numbers.items()}
+        for name, mean in means.items():
+            self.logger.record(name, mean)
         if self.bisim_coef > 0:
             self.logger.record("bisim/mu_ratio_target", self.c_r / (1 - self._c_t))
             if means["bisim/mu_rd"] > 0:  # all rewards equal: no ratio

@@ -27,6 +27,9 @@ def check_arguments(model: "BisimSAC") -> None:
     for name in ("bisim_coef", "c_r", "intrinsic_reward_scale", "intrinsic_reward_max", "inverse_dynamics_coef"):
         _require(_is_number(getattr(model, name), 0), model, name, "a finite number >= 0")
     _require(model.model_coef is None or _is_number(model.model_coef, 0), model, "model_coef", "None or a finite number >= 0")
+    needed = model.bisim_coef > 0 or model.intrinsic_reward_scale > 0
+    trained = model.model_coef != 0 or not needed
+    _require(trained, model, "model_coef", "above 0 where bisim_coef or intrinsic_reward_scale needs the dynamics model")
     gamma_fits = model.c_t is not None or 0 <= model.gamma < 1
     _require(gamma_fits, model, "gamma", "in [0, 1) when c_t is None, which stands for gamma")
     below_one = model.c_t is None or (_is_number(model.c_t, 0) and model.c_t < 1)
@@ -78,7 +81,11 @@ def _check_policy_fits(model: "BisimSAC") -> None:
 
 
 def _is_number(value: Any, least: float = -np.inf) -> bool:
-    return isinstance(value, (int, float, np.number)) and bool(np.isfinite(value) and value >= least)
+    return (
+        isinstance(value, (int, float, np.number))
+        and not isinstance(value, bool)
+        and bool(np.isfinite(value) and value >= least)
+    )
 
 
 def _require(condition: Any, model: "BisimSAC", name: str, remedy: str) -> None:

@@ -97,7 +97,7 @@ def with_intrinsic_reward(
     wrapper = next((layer for layer in chain if isinstance(layer, IntrinsicRewardVecEnv)), None)
     normalize = next((layer for layer in chain if isinstance(layer, VecNormalize)), None)
     remedy = "use VecNormalize(IntrinsicRewardVecEnv(venv), norm_reward=False)."
-    if normalize is not None and normalize.norm_reward and normalize.training:
+    if normalize is not None and normalize.norm_reward:
         raise ValueError(
             "VecNormalize(norm_reward=True): it rescales the rewards while they come in, so that neither the metric nor "
             "reward_range has a fixed unit. Pass norm_reward=False."

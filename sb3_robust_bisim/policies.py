@@ -18,6 +18,12 @@ from sb3_robust_bisim.losses import project_to_ball
 
 # Bounds of the actor's log standard deviation, reached smoothly through a tanh
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
+INVERSE_DYNAMICS_ADAM = dict(lr=1e-4, weight_decay=1e-5)
+
+
+def _fused(adam_kwargs: dict[str, Any]) -> dict[str, Any]:
+    """One kernel for all tensors: a third of the time of the default, on CPU and GPU alike."""
+    return adam_kwargs if "foreach" in adam_kwargs else {"fused": True, **adam_kwargs}
 
 
 def _inside_ball(
@@ -124,7 +130,8 @@ class BisimPolicy(SACPolicy):
         of its own, trained by the actor loss as in SB3's SAC; the metric then shapes the critic's alone
     :param inverse_dynamics_optimizer_kwargs: Adam's arguments for the inverse-dynamics model. Its learning rate is
         its own and follows no schedule
-    :param ortho_init: orthogonal initialisation of all weights, biases 0
+    :param ortho_init: orthogonal initialisation of all weights, biases 0. False where ``features_extractor_class`` brings
+        weights that it has learned before
 
     All other parameters are those of :class:`stable_baselines3.sac.policies.SACPolicy`.
     """
@@ -140,6 +147,7 @@ class BisimPolicy(SACPolicy):
         lr_schedule: Schedule,
         *,
         features_extractor_class: type[BaseFeaturesExtractor] = MlpEncoder,
+        features_extractor_kwargs: dict[str, Any] | None = None,
         share_features_extractor: bool = True,
         radius: float | None = None,
         dynamics: str = "deterministic",
@@ -153,17 +161,20 @@ class BisimPolicy(SACPolicy):
         self.radius = radius
         self.dynamics_kind = dynamics
         self.bf16 = bf16
-        self.inverse_dynamics_optimizer_kwargs = inverse_dynamics_optimizer_kwargs or dict(lr=1e-4, weight_decay=1e-5)
+        self.inverse_dynamics_optimizer_kwargs = {**INVERSE_DYNAMICS_ADAM, **(inverse_dynamics_optimizer_kwargs or {})}
         self.ortho_init = ortho_init
         optimizer_kwargs = dict(optimizer_kwargs or {})
-        if optimizer_class in (th.optim.Adam, th.optim.AdamW) and "foreach" not in optimizer_kwargs:
-            # one kernel for all tensors: a third of the time of the default on CPU and GPU alike
-            optimizer_kwargs.setdefault("fused", True)
+        if optimizer_class in (th.optim.Adam, th.optim.AdamW):
+            optimizer_kwargs = _fused(optimizer_kwargs)
+        if not kwargs.get("normalize_images", True) and issubclass(features_extractor_class, (PixelEncoder, CombinedEncoder)):
+            # SB3 tells only its own extractors that images are floats already
+            features_extractor_kwargs = {"normalized_image": True, **(features_extractor_kwargs or {})}
         super().__init__(
             observation_space,
             action_space,
             lr_schedule,
             features_extractor_class=features_extractor_class,
+            features_extractor_kwargs=features_extractor_kwargs,
             share_features_extractor=share_features_extractor,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
@@ -192,7 +203,7 @@ class BisimPolicy(SACPolicy):
             **self.optimizer_kwargs,
         )
         self.inverse_dynamics.optimizer = th.optim.Adam(
-            self.inverse_dynamics.parameters(), **{"fused": True, **self.inverse_dynamics_optimizer_kwargs}
+            self.inverse_dynamics.parameters(), **_fused(self.inverse_dynamics_optimizer_kwargs)
         )
 
     def actor_parameters(self) -> list[nn.Parameter]:

@@ -4,12 +4,14 @@ from pathlib import Path
 
 import imageio.v2 as imageio
 import numpy as np
+from PIL import Image
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_robust_bisim.atomic import atomic_path
 
 COLUMNS, ROWS = 8, 4
+MAX_FRAMES = 1000  # of a task whose episodes do not end
 
 
 def record(model: BaseAlgorithm, venv: VecEnv, folder: Path) -> tuple[Path, Path]:
@@ -21,9 +23,11 @@ def record(model: BaseAlgorithm, venv: VecEnv, folder: Path) -> tuple[Path, Path
     :param folder: where ``agent.mp4`` and ``what_the_agent_sees.png`` are put
     :return: the two files
     """
-    shown, seen, done = [], [], False
+    shown: list[np.ndarray | None] = []
+    seen: list[np.ndarray] = []
+    done = False
     obs = venv.reset()
-    while not done:
+    while not done and len(shown) < MAX_FRAMES:
         shown.append(venv.render())
         seen.append(_newest_frame(np.asarray(obs)[0]))
         action, _ = model.predict(obs, deterministic=True)  # type: ignore[arg-type]
@@ -32,7 +36,7 @@ def record(model: BaseAlgorithm, venv: VecEnv, folder: Path) -> tuple[Path, Path
     with atomic_path(folder / "agent.mp4") as temporary:
         imageio.mimwrite(temporary, shown, format="FFMPEG", fps=25, macro_block_size=2)  # type: ignore[arg-type]
     with atomic_path(folder / "what_the_agent_sees.png") as temporary:
-        imageio.imwrite(temporary, contact_sheet(seen), format="PNG-PIL")
+        Image.fromarray(contact_sheet(seen)).save(temporary)
     return folder / "agent.mp4", folder / "what_the_agent_sees.png"
 
 
@@ -46,7 +50,7 @@ def contact_sheet(frames: list[np.ndarray]) -> np.ndarray:
 
 
 def _newest_frame(stack: np.ndarray) -> np.ndarray:
-    """The last RGB frame of a stack of either channel order, (H, W, 3)."""
+    """The last frame of a stack of either channel order, RGB or grey, as (H, W, 3)."""
     if stack.shape[0] < stack.shape[-1]:
         stack = stack.transpose(1, 2, 0)
-    return stack[..., -3:]
+    return stack[..., -3:] if stack.shape[-1] % 3 == 0 else stack[..., -1:].repeat(3, axis=-1)

@@ -4,12 +4,13 @@ import argparse
 import difflib
 import inspect
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import optuna
-import rl_zoo3.cli
+import rl_zoo3.enjoy
 import rl_zoo3.train
 import yaml
 from matplotlib.figure import Figure
@@ -24,28 +25,31 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_robust_bisim.atomic import atomic_path
 from sb3_robust_bisim.bisim_sac import BisimSAC
-from sb3_robust_bisim.record import record
 
 ALGO = "bisim_sac"
 DEFAULT_CONFIG = Path("zoo_configs/bisim_sac.yml")
 # What an entry of a zoo YAML may hold beside the arguments of the algorithm
+WEIGHTS = (("bisim_coef", 0.05, 5.0), ("intrinsic_reward_scale", 0.01, 20.0), ("inverse_dynamics_coef", 0.01, 20.0))
 ZOO_KEYS = (
     *("callback", "env_kwargs", "env_wrapper", "eval_env_kwargs", "frame_stack", "monitor_kwargs", "n_envs"),
     *("n_timesteps", "noise_std", "noise_type", "normalize", "policy", "variants", "vec_env_wrapper"),
 )
 
 
+PASSED_BY_THE_ZOO = {"kwargs", "env", "seed", "verbose", "device", "tensorboard_log", "_init_setup_model"}
+
+
 def sample_bisim_sac_params(
     trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
 ) -> dict[str, Any]:
-    """Optuna's search space: that of SAC, and the weights of metric, bonus and inverse dynamics."""
-    return {
-        **sample_sac_params(trial, n_actions, n_envs, additional_args),
-        "bisim_coef": trial.suggest_float("bisim_coef", 0.05, 5.0, log=True),
-        "intrinsic_reward_scale": trial.suggest_float("intrinsic_reward_scale", 0.01, 20.0, log=True),
-        "inverse_dynamics_coef": trial.suggest_float("inverse_dynamics_coef", 0.01, 20.0, log=True),
-        "policy_delay": trial.suggest_int("policy_delay", 1, 2),
-    }
+    """Optuna's search space: that of SAC, and the weights of metric, bonus and inverse dynamics where the method has them."""
+    sampled = sample_sac_params(trial, n_actions, n_envs, additional_args)
+    # SAC's sampler replaces all of policy_kwargs
+    sampled["policy_kwargs"] = {**BisimExperimentManager.tuned.get("policy_kwargs", {}), **sampled["policy_kwargs"]}
+    for name, low, high in WEIGHTS:
+        if BisimExperimentManager.tuned.get(name, 1.0) > 0:
+            sampled[name] = trial.suggest_float(name, low, high, log=True)
+    return {**sampled, "policy_delay": trial.suggest_int("policy_delay", 1, 2)}
 
 
 ALGOS[ALGO] = BisimSAC
@@ -62,6 +66,8 @@ def variant_settings(config: str | Path, env_id: str, *names: str) -> dict[str, 
     :param names: variants, ("DBC",) or ("SAC", "clean", "small") for example
     :raises ValueError: if the file knows no such variant
     """
+    if not str(config).endswith((".yml", ".yaml")):
+        raise ValueError(f"-conf {config}: --variant needs a YAML file.")
     content = yaml.safe_load(Path(config).read_text())
     general, own = content.get("variants", {}), content.get(env_id, {}).get("variants", {})
     settings: dict[str, Any] = {}
@@ -80,7 +86,7 @@ def check_keys(hyperparams: dict[str, Any], source: str) -> None:
     :param source: file name, for the message
     :raises ValueError: naming the key and the closest known one
     """
-    known = {*ZOO_KEYS, *inspect.signature(BisimSAC).parameters, *inspect.signature(SAC).parameters} - {"kwargs", "env"}
+    known = {*ZOO_KEYS, *inspect.signature(BisimSAC).parameters, *inspect.signature(SAC).parameters} - PASSED_BY_THE_ZOO
     for key in hyperparams:
         if key not in known:
             hint = difflib.get_close_matches(key, known, n=1)
@@ -91,8 +97,14 @@ class BisimExperimentManager(ExperimentManager):
     """The zoo's experiment manager, plus named variants, evaluation in another task, key checks and a report at the end."""
 
     variants: ClassVar[list[str]] = []
+    tuned: ClassVar[dict[str, Any]] = {}  # hyperparameters of the method that Optuna tunes
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        if self.continue_training and not self.variants:
+            # the variant that the agent was trained as: `load` takes the entry's settings in place of the saved ones
+            arguments = Path(self.trained_agent).parent / self.env_name / "args.yml"
+            if arguments.is_file():
+                BisimExperimentManager.variants = yaml.unsafe_load(arguments.read_text()).get("variant", [])
         if self.variants:  # the command line's own -params win
             settings = variant_settings(self.config, self.env_name.gym_id, *self.variants)
             self.custom_hyperparams = {**settings, **(self.custom_hyperparams or {})}
@@ -107,17 +119,19 @@ class BisimExperimentManager(ExperimentManager):
         self.args.variant = self.variants  # kept in the run's args.yml
         env_kwargs = self.env_kwargs or hyperparams.get("env_kwargs", {})
         eval_kwargs = hyperparams.pop("eval_env_kwargs", {})
+        BisimExperimentManager.tuned = dict(hyperparams)
         self.eval_env_kwargs = {**env_kwargs, **eval_kwargs, **(self._eval_env_kwargs_args or {})}
         return hyperparams, saved_hyperparams
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         super().save_trained_model(model)
         title = f"{self.env_name} {' '.join(self.variants) or self.algo}"
-        report(Path(self.save_path), title, learning_starts=getattr(model, "learning_starts", 0))
-        if is_image_space(model.observation_space):
-            venv = self._seen_by_the_agent()
-            print("Agent at work: ", *record(model, venv, Path(self.save_path)))
-            venv.close()
+        report(Path(self.save_path), title, -1 if self.continue_training else getattr(model, "learning_starts", -1))
+        if self.algo == ALGO and is_image_space(model.observation_space):
+            from sb3_robust_bisim.record import record  # needs the packages of the pixel tasks
+
+            with closing(self._seen_by_the_agent()) as venv:
+                print("Agent at work: ", *record(model, venv, Path(self.save_path)))
         print(f"Model:          {self.save_path}/{self.env_name}.zip")
         if self.tensorboard_log:
             print(f"TensorBoard:    tensorboard --logdir {self.tensorboard_log}")
@@ -137,9 +151,10 @@ def report(run: Path, title: str, learning_starts: int) -> None:
 
     :param run: folder with the ``evaluations.npz`` of SB3's EvalCallback; without one there is nothing to report
     :param title: of the picture
-    :param learning_starts: steps before which nothing was learned
+    :param learning_starts: steps before which nothing was learned, -1 if the agent had learned before
     """
     if not (run / "evaluations.npz").exists():
+        print("No evaluation, no learning curve: --eval-freq was larger than the number of steps, or negative.")
         return
     with np.load(run / "evaluations.npz") as evaluations:
         steps, returns = evaluations["timesteps"], evaluations["results"]
@@ -154,7 +169,7 @@ def report(run: Path, title: str, learning_starts: int) -> None:
         figure.savefig(temporary, dpi=120, format="png")
     print(f"Evaluation return, mean of {returns.shape[1]} episodes:")
     print(f"  {'before training' if steps[0] <= learning_starts else 'at first'} (step {steps[0]}): {mean[0]:.1f}")
-    print(f"  after training (step {steps[-1]}): {mean[-1]:.1f}")
+    print(f"  last (step {steps[-1]}): {mean[-1]:.1f}")
     print(f"Learning curve: {run / 'learning_curve.png'}")
 
 
@@ -169,7 +184,18 @@ def main() -> None:
         sys.argv[2:] = _train_arguments(sys.argv[2:])
     elif sys.argv[1] == "enjoy" and "--algo" not in sys.argv:
         sys.argv[2:2] = ["--algo", ALGO]
-    rl_zoo3.cli.main()
+    command = sys.argv.pop(1)
+    if command == "train":
+        rl_zoo3.train.train()
+    elif command == "enjoy":
+        rl_zoo3.enjoy.enjoy()
+    else:
+        try:
+            from rl_zoo3 import cli
+        except ImportError as error:
+            raise ImportError(f"{command} needs the extra `plots`: pip install sb3_robust_bisim[plots]") from error
+        sys.argv.insert(1, command)
+        cli.main()
 
 
 def _train_arguments(arguments: list[str]) -> list[str]:

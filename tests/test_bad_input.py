@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv, SimpleMultiObsEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize
@@ -72,6 +73,7 @@ def test_a_value_out_of_range_is_refused_by_name(name: str, value: Any) -> None:
     [
         (dict(gamma=1.0), r"gamma=1.0: it must be in \[0, 1\) when c_t is None"),
         (dict(c_r=0), "c_r=0: it must be above 0, or norm_constraint=False"),
+        (dict(model_coef=0.0), "model_coef=0.0: it must be above 0 where bisim_coef or intrinsic_reward_scale needs"),
         (dict(n_steps=3), "n_steps=3 .* Use n_steps=1"),
         (dict(replay_buffer_kwargs=dict(n_steps=3)), "n_steps=3 .* Use n_steps=1"),
         (dict(n_steps=3, replay_buffer_kwargs=dict(n_steps=1)), "n_steps=3 .* Use n_steps=1"),
@@ -87,7 +89,7 @@ def test_settings_without_a_meaning_are_refused(settings: dict[str, Any], messag
 def test_the_same_settings_are_taken_where_they_have_one() -> None:
     make_model(gamma=1.0, c_t=0.9)
     make_model(c_r=0, norm_constraint=False)
-    make_model(c_t=0, bisim_coef=0, model_coef=0, intrinsic_reward_max=0, reward_range=[-1, 0])
+    make_model(c_t=0, bisim_coef=0, model_coef=0, intrinsic_reward_scale=0, intrinsic_reward_max=0, reward_range=[-1, 0])
 
 
 @pytest.mark.parametrize(
@@ -137,6 +139,7 @@ def test_hindsight_replay_with_a_bonus_is_refused() -> None:
 
 RIGHT_ORDER = r"use VecNormalize\(IntrinsicRewardVecEnv\(venv\), norm_reward=False\)"
 CHAINS: list[tuple[Callable[[], VecEnv], str]] = [
+    (lambda: VecNormalize(venv(), training=False), r"VecNormalize\(norm_reward=True\).*Pass norm_reward=False"),
     (lambda: VecNormalize(venv(), norm_obs=False), r"VecNormalize\(norm_reward=True\).*Pass norm_reward=False"),
     (lambda: VecNormalize(IntrinsicRewardVecEnv(venv())), r"VecNormalize\(norm_reward=True\).*Pass norm_reward=False"),
     (
@@ -206,6 +209,21 @@ def test_a_reward_that_is_not_finite_stops_training_and_tells_where(reward: floa
     with pytest.raises(ValueError, match=rf"train/critic_loss became {reward} at update 4: training has stopped"):
         model.learn(30)
     assert model.num_timesteps == 14
+
+
+def test_the_first_loss_to_break_is_named_before_those_that_follow() -> None:
+    model = make_model().learn(20)
+    inner, calls = model.policy.dynamics.forward, []
+
+    def break_at_the_third(z: th.Tensor, actions: th.Tensor) -> Any:
+        calls.append(None)
+        prediction = inner(z, actions)
+        return prediction._replace(mean=prediction.mean * float("nan")) if len(calls) == 3 else prediction
+
+    model.policy.dynamics.forward = break_at_the_third  # type: ignore[method-assign]
+    third = model._n_updates + 3
+    with pytest.raises(ValueError, match=rf"train/(dynamics|reward|bisim)_loss became nan at update {third}"):
+        model.train(gradient_steps=10, batch_size=8)
 
 
 def test_the_update_is_named_also_inside_many_gradient_steps() -> None:

@@ -341,3 +341,24 @@ def test_the_initial_gradient_steps_are_done_once() -> None:
     model = make_model(initial_gradient_steps=7)
     counts = [model.learn(1, reset_num_timesteps=False)._n_updates for _ in range(EPISODE + 3)]
     assert counts == [0] * EPISODE + [7, 8, 9]
+
+
+def test_images_that_are_floats_already_are_encoded_as_they_are() -> None:
+    class FloatImages(gym.ObservationWrapper):
+        def __init__(self, env: gym.Env) -> None:
+            super().__init__(env)
+            self.observation_space = gym.spaces.Box(0, 1, (1, 36, 36), np.float32)
+
+        def observation(self, observation: np.ndarray) -> np.ndarray:
+            return observation.reshape(1, 36, 36).astype(np.float32) / 255
+
+    env = FloatImages(FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False, channel_first=True))
+    policy_kwargs = dict(normalize_images=False, net_arch=[16])
+    model = BisimSAC("CnnPolicy", env, buffer_size=50, learning_starts=10, batch_size=4, policy_kwargs=policy_kwargs).learn(14)
+    assert type(model.critic.features_extractor).__name__ == "PixelEncoder"
+
+
+def test_one_setting_of_the_inverse_dynamics_optimizer_leaves_the_others() -> None:
+    policy_kwargs = dict(inverse_dynamics_optimizer_kwargs=dict(weight_decay=0.0, foreach=True), net_arch=[16])
+    group = BisimSAC("MlpPolicy", "Pendulum-v1", policy_kwargs=policy_kwargs).policy.inverse_dynamics.optimizer.param_groups[0]
+    assert (group["lr"], group["weight_decay"], group["foreach"]) == (1e-4, 0.0, True)

@@ -12,7 +12,7 @@ import yaml
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER
 
 from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer
-from sb3_robust_bisim.zoo import check_keys, main, sample_bisim_sac_params, variant_settings
+from sb3_robust_bisim.zoo import BisimExperimentManager, check_keys, main, sample_bisim_sac_params, variant_settings
 
 ROOT = Path(__file__).parent.parent
 CONFIG = ROOT / "zoo_configs" / "bisim_sac.yml"
@@ -31,6 +31,8 @@ class Zoo:
 
     def __call__(self, *arguments: str) -> str:
         self.monkeypatch.chdir(ROOT)
+        for name, value in (("variants", []), ("tuned", {})):  # outside of tests each command is a process of its own
+            self.monkeypatch.setattr(BisimExperimentManager, name, value)
         self.monkeypatch.setattr(sys, "argv", ["sb3_robust_bisim", *arguments])
         try:
             main()
@@ -84,7 +86,7 @@ def test_train_evaluates_in_the_standard_task_and_reports_and_resumes_and_plays(
     # in the standard task every step pays 1, in the sparse one almost none does
     np.testing.assert_array_equal(evaluations["results"], evaluations["ep_lengths"])
     assert f"before training (step 40): {evaluations['results'][0].mean():.1f}" in output
-    assert f"after training (step 120): {evaluations['results'][-1].mean():.1f}" in output
+    assert f"last (step 120): {evaluations['results'][-1].mean():.1f}" in output
     assert (run / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
     folder = run / "robust_bisim-SparseCartPole-v0"
     assert yaml.unsafe_load((folder / "args.yml").read_text())["variant"] == ["normed-ID"]
@@ -95,7 +97,10 @@ def test_train_evaluates_in_the_standard_task_and_reports_and_resumes_and_plays(
 
     resumed = zoo("train", "--env", CARTPOLE, *common, "-i", str(run / "robust_bisim-SparseCartPole-v0.zip"), *SHORT)
     assert "Loading pretrained agent" in resumed
-    assert (tmp_path / "bisim_sac" / "robust_bisim-SparseCartPole-v0_2" / "robust_bisim-SparseCartPole-v0.zip").exists()
+    assert "at first (step 40)" in resumed  # it had learned before
+    second = tmp_path / "bisim_sac" / "robust_bisim-SparseCartPole-v0_2"
+    model = BisimSAC.load(second / "robust_bisim-SparseCartPole-v0.zip")
+    assert (model.intrinsic_reward_scale, model.inverse_dynamics_coef) == (0.0, 1.0)  # still normed-ID
     played = zoo("enjoy", "--env", CARTPOLE, "-f", str(tmp_path), "--exp-id", "1", "-n", "30", "--no-render")
     assert "Episode Reward" in played or "Loading" in played
 
@@ -185,6 +190,15 @@ def test_optuna_samples_arguments_that_bisim_sac_takes() -> None:
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     study.optimize(objective, n_trials=3)
     assert len({trial.value for trial in study.trials}) == 3
+
+
+def test_optuna_leaves_off_what_the_tuned_method_leaves_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    tuned = {**SAC, "policy_kwargs": {"n_critics": 1}}
+    monkeypatch.setattr(BisimExperimentManager, "tuned", tuned)
+    trial = optuna.create_study().ask()
+    sampled = sample_bisim_sac_params(trial, 1, 1, {"using_her_replay_buffer": False, "her_kwargs": {}})
+    assert not sampled.keys() & {"bisim_coef", "intrinsic_reward_scale", "inverse_dynamics_coef"}
+    assert sampled["policy_kwargs"].keys() == {"n_critics", "net_arch"}
 
 
 def test_it_runs_as_a_module_and_help_tells_of_the_commands_and_of_our_options(zoo: Zoo) -> None:

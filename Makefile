@@ -23,7 +23,7 @@ $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt
 	touch $@
 
 train: setup  ## the full method on noisy sparse cartpole (two distractors per state dimension)
-	$(BIN)/python -m sb3_robust_bisim train --env robust_bisim/SparseCartPole-v0 --n-timesteps 7000 --seed 0 \
+	$(BIN)/python -m sb3_robust_bisim train --env robust_bisim/SparseCartPole-v0 --n-timesteps 10000 --seed 0 \
 		--eval-freq 500 --eval-episodes 10 --log-interval 20 --progress --verbose 0 --log-folder logs --tensorboard-log logs/tensorboard
 
 train-pixels: setup  ## a few minutes of cartpole-swingup from pixels with video behind it; ends with a video of the agent

@@ -169,7 +169,9 @@ def report(run: Path, title: str, learning_starts: int) -> None:
         figure.savefig(temporary, dpi=120, format="png")
     print(f"Evaluation return, mean of {returns.shape[1]} episodes:")
     print(f"  {'before training' if steps[0] <= learning_starts else 'at first'} (step {steps[0]}): {mean[0]:.1f}")
-    print(f"  last (step {steps[-1]}): {mean[-1]:.1f}")
+    best = int(mean.argmax())
+    print(f"  best (step {steps[best]}): {mean[best]:.1f}, kept as {run / 'best_model.zip'}")
+    print(f"  after training (step {steps[-1]}): {mean[-1]:.1f}")
     print(f"Learning curve: {run / 'learning_curve.png'}")
 
 

@@ -86,7 +86,7 @@ def test_train_evaluates_in_the_standard_task_and_reports_and_resumes_and_plays(
     # in the standard task every step pays 1, in the sparse one almost none does
     np.testing.assert_array_equal(evaluations["results"], evaluations["ep_lengths"])
     assert f"before training (step 40): {evaluations['results'][0].mean():.1f}" in output
-    assert f"last (step 120): {evaluations['results'][-1].mean():.1f}" in output
+    assert f"after training (step 120): {evaluations['results'][-1].mean():.1f}" in output
     assert (run / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
     folder = run / "robust_bisim-SparseCartPole-v0"
     assert yaml.unsafe_load((folder / "args.yml").read_text())["variant"] == ["normed-ID"]

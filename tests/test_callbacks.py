@@ -1,0 +1,241 @@
+"""What the diagnostics write, read back from the event files; and that they leave the run alone."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from rl_zoo3.utils import get_callback_list
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from sb3_robust_bisim import BisimSAC
+from sb3_robust_bisim.callbacks import DenoisingFactorCallback, EmbeddingCallback, ValueBoundCallback
+from sb3_robust_bisim.envs import NoiseObservation
+
+SETTINGS: dict[str, Any] = dict(
+    policy_kwargs=dict(net_arch=[16]), learning_starts=20, batch_size=16, buffer_size=200, train_freq=10, seed=0
+)
+NOISY = "robust_bisim/SparseCartPole-v0"
+
+
+class Picture(gym.Env):
+    """The state is one of 256 shades of an 8x8 frame, on top of which lies noise; steps 1 to 6 pay 0, 0, 0, 1, 1, 1."""
+
+    observation_space = gym.spaces.Box(0, 255, (8, 8, 3), np.uint8)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, clean_obs: bool = False, noise: int = 128, time_out: bool = False) -> None:
+        self.clean_obs = clean_obs
+        self.noise = noise
+        self.time_out = time_out
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.t = 0
+        return self._observe()
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.t += 1
+        obs, info = self._observe()
+        over = self.t == 6
+        return obs, float(self.t > 3), over and not self.time_out, over and self.time_out, info
+
+    def _observe(self) -> tuple[np.ndarray, dict]:
+        clean = np.full((8, 8, 3), 20 * self.t, np.uint8)
+        noise = self.np_random.integers(0, self.noise + 1, (8, 8, 3), dtype=np.uint8)
+        return clean + noise, {"clean_obs": clean} if self.clean_obs else {}
+
+
+gym.register("test/Picture-v0", Picture)  # type: ignore[arg-type]
+
+
+class Wave(gym.Env):
+    """An environment without an id, that only ever begins."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        return np.zeros(2, np.float32), {}
+
+
+class FlatEncoder(th.nn.Module):
+    """z = the first two numbers of the observation, or of the noise at its end."""
+
+    def __init__(self, where: slice) -> None:
+        super().__init__()
+        self.where = where
+
+    def forward(self, obs: th.Tensor) -> th.Tensor:
+        return th.nn.functional.pad(obs.flatten(1)[:, self.where], (0, 48))
+
+
+def events(folder: Path) -> EventAccumulator:
+    accumulator = EventAccumulator(str(folder / "BisimSAC_1"), size_guidance={"images": 0})
+    accumulator.Reload()
+    return accumulator
+
+
+def scalars(folder: Path, key: str) -> np.ndarray:
+    return np.array([event.value for event in events(folder).Scalars(key)])
+
+
+def learn(
+    folder: Path | None, callback: Any, steps: int = 60, env: Any = None, policy: str = "MlpPolicy", **kwargs: Any
+) -> BisimSAC:
+    env = gym.make(NOISY, noise_multiplier=2) if env is None else env
+    model = BisimSAC(policy, env, tensorboard_log=None if folder is None else str(folder), **{**SETTINGS, **kwargs})
+    model.learn(steps, callback)
+    model.logger.close()
+    return model
+
+
+def test_the_projector_holds_each_state_with_its_value_and_reward(tmp_path: Path) -> None:
+    model = learn(tmp_path, EmbeddingCallback(every=25, n_states=40))
+    folders = sorted(path.name for path in (tmp_path / "BisimSAC_1").iterdir() if path.is_dir())
+    assert folders == ["00025", "00050", "00060"]  # and once more at the end
+    last = tmp_path / "BisimSAC_1" / "00060" / "embedding"
+    z = np.loadtxt(last / "tensors.tsv")
+    header, *rows = (last / "metadata.tsv").read_text().splitlines()
+    values = np.array([row.split("\t") for row in rows], dtype=float)
+    assert header == "value\treward"
+    assert z.shape == (40, 50)
+    assert values.shape == (40, 2)
+    assert values[:, 0].std() > 0
+    # the rows are embeddings of states in the buffer, and the values those of the critic
+    with th.no_grad():
+        buffer = model.replay_buffer
+        assert buffer is not None
+        obs = th.as_tensor(buffer.observations[:60, 0])
+        stored = model.critic.encode(obs)
+        q = model.critic.q_values(stored, model.actor(obs, deterministic=True))
+    rows_of_z = th.as_tensor(z).float()
+    distance, nearest = (rows_of_z[:, None] - stored).norm(dim=-1).min(dim=1)
+    assert distance.max() < 1e-5
+    np.testing.assert_allclose(th.cat(q, dim=1).min(dim=1).values[nearest], values[:, 0], atol=1e-4)
+    assert 'tensor_path: "00060/embedding/tensors.tsv"' in (tmp_path / "BisimSAC_1" / "projector_config.pbtxt").read_text()
+
+
+def test_the_plane_of_the_principal_components_is_drawn(tmp_path: Path) -> None:
+    learn(tmp_path, EmbeddingCallback(every=30, n_states=40))
+    images = events(tmp_path).Images("embedding/pca")
+    assert [image.step for image in images] == [30, 60]
+    assert images[0].encoded_image_string.startswith(b"\x89PNG")
+    assert images[0].encoded_image_string != images[1].encoded_image_string
+
+
+def test_frames_become_sprites(tmp_path: Path) -> None:
+    from PIL import Image
+
+    env = VecFrameStack(make_vec_env("test/Picture-v0", env_kwargs=dict(noise=0)), 2)
+    learn(tmp_path, EmbeddingCallback(every=60, n_states=4), env=env, policy="CnnPolicy")
+    folder = tmp_path / "BisimSAC_1" / "00060" / "embedding"
+    sprite = np.asarray(Image.open(folder / "sprite.png"))
+    assert sprite.shape[:2] == (16, 16)  # 2 x 2 frames of 8 x 8
+    assert set(np.unique(sprite)) <= {20 * t for t in range(7)}
+    assert len((folder / "metadata.tsv").read_text().splitlines()) == 5
+
+
+@pytest.mark.parametrize(("where", "expected"), [(slice(0, 2), 1.0), (slice(-2, None), 0.0)])
+def test_the_denoising_factor_tells_states_from_noise(where: slice, expected: float, tmp_path: Path) -> None:
+    model = learn(None, None, steps=1)
+    model.critic.features_extractor.net = FlatEncoder(where)
+    model.tensorboard_log = str(tmp_path)
+    model.learn(1, DenoisingFactorCallback(n_states=300))
+    assert scalars(tmp_path, "bisim/denoising_factor") == pytest.approx(expected, abs=0.15)
+
+
+def test_the_denoising_factor_compares_stacked_frames_with_their_clean_ones(tmp_path: Path) -> None:
+    for noise in (0, 128):
+        env = VecFrameStack(make_vec_env("test/Picture-v0", env_kwargs=dict(noise=noise)), 3)
+        folder = tmp_path / str(noise)
+        learn(folder, DenoisingFactorCallback(40, 30, env_kwargs=dict(clean_obs=True)), 40, env, policy="CnnPolicy")
+    assert scalars(tmp_path / "0", "bisim/denoising_factor") == 1.0  # without noise both looks are one
+    assert scalars(tmp_path / "128", "bisim/denoising_factor") < 0.9
+
+
+@pytest.mark.parametrize(("time_out", "rest"), [(False, 0.0), (True, 2.0)])
+def test_exact_distances_keep_the_bound_and_a_collapsed_embedding_breaks_it(
+    time_out: bool, rest: float, tmp_path: Path
+) -> None:
+    # steps 0 to 5 are followed by the rewards 0, 0, 0, 1, 1, 1 and, if time ran out, by what the critic expects
+    rewards = [0, 0, 0, 1, 1, 1, rest]
+    values = th.tensor([sum(0.9**k * reward for k, reward in enumerate(rewards[t:])) for t in range(7)])
+    for scale in (0.0, 1.01):
+        env = gym.make("test/Picture-v0", noise=0, time_out=time_out)
+        model = BisimSAC("CnnPolicy", env, gamma=0.9, distance="l1", tensorboard_log=str(tmp_path / str(scale)), **SETTINGS)
+
+        def encode(obs: th.Tensor, scale: float = scale) -> th.Tensor:
+            return th.nn.functional.pad(scale * values[(obs[:, 0, 0, :1] / 20).long()], (0, 49))
+
+        model.critic.encode = encode  # type: ignore[method-assign,assignment]
+        model.critic.q_values = lambda z, actions: (th.full((len(z), 1), 2.0),)  # type: ignore[method-assign]
+        model.learn(1, ValueBoundCallback(n_states=30))
+        found = {key: scalars(tmp_path / str(scale), f"bisim/value_{key}")[0] for key in ("gap", "bound", "bound_violations")}
+        assert found["gap"] > 0
+        assert found["bound"] == pytest.approx(scale * found["gap"], rel=1e-4)
+        assert found["bound_violations"] == (0 if scale > 1 else pytest.approx(5 / 6, abs=0.05))  # all but equal states
+
+
+def test_a_watched_run_is_bit_for_bit_the_run_without(tmp_path: Path) -> None:
+    callbacks = [EmbeddingCallback(20, 10), DenoisingFactorCallback(20, 10), ValueBoundCallback(20, 10)]
+    watched, alone = (learn(tmp_path, callback) for callback in (callbacks, None))
+    for name, value in watched.policy.state_dict().items():
+        assert th.equal(value, alone.policy.state_dict()[name]), name
+
+
+def test_a_zoo_yaml_can_name_them(tmp_path: Path) -> None:
+    names = ["EmbeddingCallback", "DenoisingFactorCallback", "ValueBoundCallback"]
+    first, *others = [f"sb3_robust_bisim.callbacks.{name}" for name in names]
+    callbacks = get_callback_list({"callback": [first, *({name: {"every": 30, "n_states": 20}} for name in others)]})
+    venv = VecNormalize(make_vec_env(NOISY, 2, env_kwargs=dict(noise_multiplier=1)), norm_reward=False)
+    learn(tmp_path, callbacks, env=venv)
+    found = events(tmp_path).Tags()
+    keys = ("denoising_factor", "value_bound_violations", "value_gap", "value_bound")
+    assert {f"bisim/{key}" for key in keys} <= set(found["scalars"])
+    assert {"embedding/pca", "bisim/value_gap_against_bound"} <= set(found["images"])
+    for key in keys:
+        values = scalars(tmp_path, f"bisim/{key}")
+        assert len(values) == 2
+        assert np.isfinite(values).all()
+
+
+@pytest.mark.parametrize(
+    ("callback", "env", "message"),
+    [
+        (EmbeddingCallback(), None, "tensorboard_log=None"),
+        (DenoisingFactorCallback(), gym.make(NOISY), "noise_multiplier > 0"),
+        (
+            DenoisingFactorCallback(env_kwargs=dict(noise_multiplier=1)),
+            gym.make(NOISY),
+            r"env_kwargs=\{'noise_multiplier': 1\}",
+        ),
+        (ValueBoundCallback(), DummyVecEnv([lambda: NoiseObservation(Wave(), 1)]), "pass env_id"),
+        (ValueBoundCallback(env_id="Pendulum-v1"), None, "Pendulum-v1"),
+    ],
+)
+def test_what_cannot_work_is_refused_when_training_starts(callback: BaseCallback, env: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        learn(None, callback, steps=10**9, env=env)
+
+
+def test_a_bound_needs_rewards_in_the_metric() -> None:
+    with pytest.raises(ValueError, match="c_r > 0"):
+        learn(None, ValueBoundCallback(), steps=10**9, c_r=0.0, norm_constraint=False)
+
+
+def test_another_algorithm_is_refused() -> None:
+    with pytest.raises(ValueError, match="works with BisimSAC"):
+        SAC("MlpPolicy", "Pendulum-v1").learn(10**9, EmbeddingCallback())
+
+
+@pytest.mark.parametrize(("name", "value"), [("every", 0), ("every", 2.5), ("n_states", 1)])
+def test_arguments_outside_their_range_are_refused(name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=f"{name}={value}"):
+        EmbeddingCallback(**{name: value})

@@ -167,8 +167,8 @@ def policy_bisimulation_metric(
 def bisimulation_metric(mdp: FiniteMDP, c_r: float, c_t: float, p: float = 1.0, tol: float = 1e-8) -> Array:
     """The policy-independent bisimulation metric; ``eq:ferns-bisim-metric`` is ``c_r=1 - c, c_t=c``.
 
-    ``d(i, j) = max_a c_R |R(i, a) - R(j, a)| + c_T W_p(d)(P(.|i, a), P(.|j, a))``. By Minkowski's inequality the right-hand side F
-    is a c_T-contraction in the supremum norm for every p >= 1. So the metric exists and is unique without the paper's
+    ``d(i, j) = max_a c_R |R(i, a) - R(j, a)| + c_T W_p(d)(P(.|i, a), P(.|j, a))``. By Minkowski's inequality the right-hand
+    side F is a c_T-contraction in the supremum norm for every p >= 1. So the metric exists and is unique without the paper's
     Assumption A1, and F(d) is within c_T / (1 - c_T) * ``||F(d) - d||`` of it: the stopping rule.
 
     The fixed point is found by Howard's policy iteration over couplings: find the optimal coupling of every pair, hold them,

@@ -44,9 +44,9 @@ SB3_LEFT_OUT := test_cnn.py::test_image_like_input[True-BisimSAC] test_cnn.py::t
 
 test-sb3: setup  ## Stable-Baselines3's own tests of SAC, with BisimSAC in its place
 	mkdir -p build && cd build && rm -rf stable_baselines3-* && \
-		../$(BIN)/pip download --quiet --no-deps --no-binary :all: -c ../constraints.txt stable_baselines3 && \
+		../$(BIN)/pip download --quiet --no-deps --no-binary stable_baselines3 -c ../constraints.txt stable_baselines3 && \
 		tar xzf stable_baselines3-*.tar.gz && cd stable_baselines3-*/ && \
-		PYTHONPATH=../../tests/upstream ../../$(BIN)/python -m pytest -p swap_sac -q -n 2 -k "BisimSAC or sac or her or train_freq" \
+		OMP_NUM_THREADS=1 PYTHONPATH=../../tests/upstream ../../$(BIN)/python -m pytest -p swap_sac -q -n 2 -k "BisimSAC or sac or her or train_freq" \
 		$(foreach test,$(SB3_LEFT_OUT),"--deselect=tests/$(test)") $(SB3_TESTS:%=tests/test_%.py)
 
 lint: setup  ## ruff: style and format

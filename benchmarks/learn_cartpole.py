@@ -69,13 +69,13 @@ def write(run: dict, path: Path) -> None:
         temporary.write_text(json.dumps(run, indent=1))
 
 
-def train(method: str, seed: int, steps: int, noise: int, overrides: dict, path: Path) -> dict:
+def train(method: str, seed: int, steps: int, noise: int, overrides: dict, measured: dict, path: Path) -> dict:
     if path.exists() and json.loads(path.read_text())["finished"]:
         return json.loads(path.read_text())
     th.set_num_threads(1)
     settings = {**yaml.safe_load(CONFIG.read_text())[ENV_ID], **variant_settings(CONFIG, ENV_ID, method)}
     settings |= overrides
-    run = {"method": method, "seed": seed, "noise_multiplier": noise, **machine(), "finished": False, "evaluations": []}
+    run = {"method": method, "seed": seed, "noise_multiplier": noise, **measured, "finished": False, "evaluations": []}
     run["arguments"] = {key: value for key, value in settings.items() if key not in ZOO_KEYS}
     eval_env = Monitor(gym.make(ENV_ID, noise_multiplier=noise, **settings["eval_env_kwargs"]))
     eval_env.reset(seed=10_000 + seed)
@@ -143,10 +143,11 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "learn_cartpole")
     args = parser.parse_args()
+    measured = machine()  # the code that the workers load, whatever is committed while they run
     todo = [(method, seed) for seed in range(args.seeds) for method in args.methods]
     tasks = [
         joblib.delayed(train)(
-            *(method, seed, args.steps, args.noise_multiplier, args.params),
+            *(method, seed, args.steps, args.noise_multiplier, args.params, measured),
             args.out / f"{method}_seed{seed}.json",
         )
         for method, seed in todo
@@ -154,7 +155,7 @@ def main() -> None:
     parallel = joblib.Parallel(n_jobs=args.jobs, return_as="generator")
     runs = list(tqdm(parallel(tasks), total=len(tasks), unit="run", file=sys.stderr))
     plot(runs, args.out / "curves.png", args.noise_multiplier)
-    print(json.dumps({"benchmark": "learn_cartpole", "steps": args.steps, **machine(), "methods": summary(runs)}))
+    print(json.dumps({"benchmark": "learn_cartpole", "steps": args.steps, **measured, "methods": summary(runs)}))
 
 
 if __name__ == "__main__":

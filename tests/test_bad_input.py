@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from small_models import SMALL, pendulum
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv, SimpleMultiObsEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize
@@ -19,10 +20,6 @@ from sb3_robust_bisim import BisimSAC, IntrinsicRewardVecEnv
 from sb3_robust_bisim.policies import CnnPolicy, MlpPolicy
 
 NAN, INF = float("nan"), float("inf")
-
-
-def pendulum() -> gym.Env:
-    return gym.make("Pendulum-v1", max_episode_steps=10)
 
 
 def venv() -> VecEnv:
@@ -38,16 +35,7 @@ def dicts() -> gym.Env:
 
 
 def make_model(policy: Any = "MlpPolicy", env: Any = None, **kwargs: Any) -> Any:
-    settings: dict[str, Any] = dict(
-        policy_kwargs=dict(net_arch=[16]),
-        learning_starts=10,
-        batch_size=8,
-        buffer_size=50,
-        seed=0,
-        intrinsic_reward_scale=1.0,
-        inverse_dynamics_coef=1.0,
-    )
-    return BisimSAC(policy, pendulum() if env is None else env, **{**settings, **kwargs})
+    return BisimSAC(policy, pendulum() if env is None else env, **{**SMALL, **kwargs})
 
 
 WEIGHTS = ("bisim_coef", "c_r", "model_coef", "intrinsic_reward_scale", "intrinsic_reward_max", "inverse_dynamics_coef")

@@ -9,10 +9,10 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from small_models import SMALL, pendulum
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_robust_bisim import BisimSAC, IntrinsicRewardVecEnv
@@ -22,22 +22,8 @@ OBSERVATIONS = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
 STATE_DICTS = {"policy", "actor.optimizer", "critic.optimizer", "ent_coef_optimizer", "policy.inverse_dynamics.optimizer"}
 
 
-def pendulum() -> gym.Env:
-    return gym.make("Pendulum-v1", max_episode_steps=10)
-
-
 def make_model(**kwargs: Any) -> Any:
-    settings: dict[str, Any] = dict(
-        policy_kwargs=dict(net_arch=[16]),
-        learning_starts=10,
-        batch_size=8,
-        buffer_size=50,
-        seed=0,
-        intrinsic_reward_scale=1.0,
-        inverse_dynamics_coef=1.0,
-        initial_gradient_steps=3,
-    )
-    return BisimSAC("MlpPolicy", **{"env": pendulum(), **settings, **kwargs})
+    return BisimSAC("MlpPolicy", **{"env": pendulum(), **SMALL, "initial_gradient_steps": 3, **kwargs})
 
 
 @pytest.fixture(scope="module")

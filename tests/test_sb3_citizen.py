@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from small_models import EPISODE, SMALL, pendulum
 from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv, SimpleMultiObsEnv
 from stable_baselines3.common.noise import NormalActionNoise
@@ -21,13 +22,6 @@ from torch import nn
 from sb3_robust_bisim import BisimSAC, IntrinsicRewardVecEnv
 from sb3_robust_bisim.latent_models import DYNAMICS
 from sb3_robust_bisim.losses import DISTANCES
-
-EPISODE = 10
-
-
-def pendulum() -> gym.Env:
-    """Actions in [-2, 2]; its short episodes end by time-out."""
-    return gym.make("Pendulum-v1", max_episode_steps=EPISODE)
 
 
 def unpaid_pendulum() -> gym.Env:
@@ -41,16 +35,7 @@ def images() -> gym.Env:
 
 def make_model(policy: str = "MlpPolicy", env: Any = None, **kwargs: Any) -> Any:
     """A small BisimSAC; typed as Any, since half of an algorithm's attributes are Optional."""
-    settings: dict[str, Any] = dict(
-        policy_kwargs=dict(net_arch=[16]),
-        learning_starts=EPISODE,
-        batch_size=8,
-        buffer_size=100,
-        seed=0,
-        intrinsic_reward_scale=1.0,
-        inverse_dynamics_coef=1.0,
-    )
-    return BisimSAC(policy, pendulum() if env is None else env, **{**settings, **kwargs})
+    return BisimSAC(policy, pendulum() if env is None else env, **{**SMALL, "buffer_size": 100, **kwargs})
 
 
 def with_data(*args: Any, **kwargs: Any) -> Any:

@@ -25,6 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_robust_bisim.atomic import atomic_path
 from sb3_robust_bisim.bisim_sac import BisimSAC
+from sb3_robust_bisim.checkpoint import Checkpoint, load_checkpoint
 
 ALGO = "bisim_sac"
 DEFAULT_CONFIG = Path("zoo_configs/bisim_sac.yml")
@@ -94,10 +95,16 @@ def check_keys(hyperparams: dict[str, Any], source: str) -> None:
 
 
 class BisimExperimentManager(ExperimentManager):
-    """The zoo's experiment manager, plus named variants, evaluation in another task, key checks and a report at the end."""
+    """
+    The zoo's experiment manager, plus named variants, evaluation in another task, key checks, exact continuation and a report
+    at the end.
+    """
 
     variants: ClassVar[list[str]] = []
+    checkpoint: ClassVar[Path | None] = None
+    checkpoint_freq: ClassVar[int] = 10_000
     tuned: ClassVar[dict[str, Any]] = {}  # hyperparameters of the method that Optuna tunes
+    resumed = False
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         if self.continue_training and not self.variants:
@@ -123,6 +130,49 @@ class BisimExperimentManager(ExperimentManager):
         self.eval_env_kwargs = {**env_kwargs, **eval_kwargs, **(self._eval_env_kwargs_args or {})}
         return hyperparams, saved_hyperparams
 
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        if self.checkpoint is not None and self.checkpoint.is_file():
+            return self._continue(self.checkpoint)
+        experiment = super().setup_experiment()
+        if self.checkpoint is not None and experiment is not None:
+            run = {"settings": self._settings(experiment[1]), "save_path": self.save_path, "callbacks": self.callbacks}
+            self.callbacks.append(Checkpoint(self.checkpoint, self.checkpoint_freq, run))
+        return experiment
+
+    def _settings(self, hyperparams: dict[str, Any]) -> dict[str, Any]:
+        """What must be the same for a run to be continued; it may become longer."""
+        env_kwargs = {"env_kwargs": self.env_kwargs or hyperparams.get("env_kwargs", {})}
+        return {"env": self.env_name, "seed": self.seed, **hyperparams, **env_kwargs, "n_timesteps": None}
+
+    def _continue(self, checkpoint: Path) -> tuple[BaseAlgorithm, dict[str, Any]]:
+        hyperparams, saved_hyperparams = self.read_hyperparameters()
+        here = self._settings(saved_hyperparams)
+        model, run = load_checkpoint(checkpoint)
+        there = run["settings"]
+        if differing := sorted(key for key in {*here, *there} if here.get(key) != there.get(key)):
+            pairs = ", ".join(f"{key} is {there.get(key)} there and {here.get(key)} here" for key in differing)
+            raise ValueError(
+                f"--checkpoint {checkpoint}: it belongs to another run; {pairs}. Name another file, or delete it."
+            )
+        _, self.env_wrapper, _, self.vec_env_wrapper = self._preprocess_hyperparams(hyperparams)
+        self.save_path, self.callbacks = run["save_path"], run["callbacks"]
+        self.params_path = f"{self.save_path}/{self.env_name}"
+        self.resumed = True
+        print(f"Going on from step {model.num_timesteps}, in {self.save_path}")
+        return model, saved_hyperparams
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        if not self.resumed:
+            return super().learn(model)
+        log_interval = self.log_interval if self.log_interval > -1 else 4
+        try:
+            rest = self.n_timesteps - model.num_timesteps
+            model.learn(rest, callback=self.callbacks, log_interval=log_interval, reset_num_timesteps=False)
+        except KeyboardInterrupt:  # as in the zoo: what was learned is saved
+            pass
+        finally:
+            model.env.close()  # type: ignore[union-attr]
+
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         super().save_trained_model(model)
         title = f"{self.env_name} {' '.join(self.variants) or self.algo}"
@@ -135,6 +185,8 @@ class BisimExperimentManager(ExperimentManager):
         print(f"Model:          {self.save_path}/{self.env_name}.zip")
         if self.tensorboard_log:
             print(f"TensorBoard:    tensorboard --logdir {self.tensorboard_log}")
+        if self.checkpoint is not None and model.num_timesteps >= self.n_timesteps:
+            self.checkpoint.unlink(missing_ok=True)  # nothing is left to go on with
 
     def _seen_by_the_agent(self) -> VecEnv:
         """The evaluation environment, drawing what it shows."""
@@ -175,8 +227,14 @@ def report(run: Path, title: str, learning_starts: int) -> None:
     print(f"Learning curve: {run / 'learning_curve.png'}")
 
 
-def main() -> None:
-    """``python -m sb3_robust_bisim COMMAND``: hand over to the zoo, with our defaults filled in."""
+def main(arguments: list[str] | None = None) -> None:
+    """
+    ``python -m sb3_robust_bisim COMMAND``: hand over to the zoo, with our defaults filled in.
+
+    :param arguments: in place of those of the command line
+    """
+    if arguments is not None:
+        sys.argv[1:] = arguments
     rl_zoo3.train.ExperimentManager = BisimExperimentManager  # type: ignore[misc]
     commands = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots")
     if len(sys.argv) < 2 or sys.argv[1] not in commands:
@@ -216,6 +274,16 @@ def _train_arguments(arguments: list[str]) -> list[str]:
         metavar="NAME",
         help="variants of the config file to lay over the task's entry, for example DBC, or SAC clean small",
     )
+    parser.add_argument(
+        "--checkpoint",
+        type=Path,
+        metavar="FILE",
+        help="keep everything that the next step depends on in this file; the same command goes on from it, exactly, after an "
+        "interruption (remove it to begin anew)",
+    )
+    parser.add_argument(
+        "--checkpoint-freq", type=int, default=10_000, metavar="N", help="environment steps (default: %(default)s)"
+    )
     parser.add_argument("--algo", default=ALGO, help="RL algorithm (default: %(default)s)")
     parser.add_argument(
         "-conf", "--conf-file", help=f"hyperparameters (default: {DEFAULT_CONFIG} for {ALGO}, if that file is here)"
@@ -225,6 +293,9 @@ def _train_arguments(arguments: list[str]) -> list[str]:
         print()
     ours, theirs = parser.parse_known_args(arguments)
     BisimExperimentManager.variants = ours.variants
+    BisimExperimentManager.checkpoint, BisimExperimentManager.checkpoint_freq = ours.checkpoint, ours.checkpoint_freq
+    if ours.checkpoint_freq < 1:
+        parser.error(f"--checkpoint-freq {ours.checkpoint_freq}: at least one step must lie between two checkpoints.")
     config = ours.conf_file or (str(DEFAULT_CONFIG) if ours.algo == ALGO and DEFAULT_CONFIG.is_file() else None)
     if ours.algo == ALGO and config is None and not {"-h", "--help"} & set(arguments):
         parser.error(f"-conf is needed: {DEFAULT_CONFIG} is not in this folder.")

@@ -2,6 +2,7 @@
 
 import copy
 from abc import ABC, abstractmethod
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -147,12 +148,20 @@ class ClipDistractor(Distractor):
             )
         # Those of the other split too: a broken one should not wait for the evaluation to be found
         everything = [*paths["train"], *paths["eval"]]
-        clips = {path: load_clip(path, size, grayscale=grayscale, cache_dir=cache_dir) for path in everything}
+        self._load = partial(load_clip, size=size, grayscale=grayscale, cache_dir=cache_dir)
+        clips = {path: self._load(path) for path in everything}
         self.paths = paths[split]
         self._clips = [clips[path] for path in self.paths]
         self._moving = moving
         self._clip = 0
         self._position = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_clips": None}  # they lie in the cache
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._clips = [self._load(path) for path in self.paths]
 
     def reset(self) -> None:
         self._clip = int(self._rng.integers(len(self._clips)))

@@ -100,7 +100,7 @@ class SuiteTask(gym.Env[np.ndarray, np.ndarray]):
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": max(round(1 / (shimmy_env.dt * action_repeat)), 1)}
         self._render_size = render_size
-        self._views: list[Camera] = []  # the last of them shows what ``render`` returns
+        self._views: list[Camera] = self._make_views()  # the last of them shows what ``render`` returns
         space = self._env.action_space
         assert isinstance(space, gym.spaces.Box)
         bounded = space.high < _UNBOUNDED
@@ -108,6 +108,18 @@ class SuiteTask(gym.Env[np.ndarray, np.ndarray]):
         self._half_range = np.where(bounded, (space.high - space.low) / 2, 1.0)
         self.action_space = gym.spaces.Box(-1.0, 1.0, shape=space.shape, dtype=np.float32)
         self._episode_over = True
+
+    @abstractmethod
+    def _make_views(self) -> "list[Camera]":
+        """The cameras that the task needs."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # OpenGL contexts belong to a process; which OpenGL it is must be settled before dm_control is imported
+        return _bare, (type(self), bool(self._views)), {**self.__dict__, "_views": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._views = self._make_views()
 
     @abstractmethod
     def _observe(self, state: dict[str, Any], info: dict[str, Any]) -> np.ndarray:
@@ -177,6 +189,12 @@ class SuiteTask(gym.Env[np.ndarray, np.ndarray]):
         self._env.close()
 
 
+def _bare(task_class: type[SuiteTask], rendering: bool) -> SuiteTask:
+    """A task for ``__setstate__`` to fill."""
+    import_suite(rendering)
+    return task_class.__new__(task_class)
+
+
 class StateTask(SuiteTask):
     """
     A task of the suite with its state as the observation, flattened to one float32 vector.
@@ -204,16 +222,19 @@ class StateTask(SuiteTask):
         check_task(domain, task, action_repeat, render_mode, render_size)
         import_suite(rendering=render_mode is not None)
         super().__init__(domain, task, action_repeat, camera_id, render_mode, render_size)
-        if render_mode is not None:
-            from sb3_robust_bisim.envs.camera import Camera
-
-            self._views.append(Camera(self.physics, self.camera_id, render_size))
         # A Dict, some of whose parts are single numbers of shape ()
         self._state_space = self._env.observation_space
         box = flatten_space(self._state_space)
         assert isinstance(box, gym.spaces.Box)
         low, high = box.low.astype(np.float32), box.high.astype(np.float32)
         self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
+
+    def _make_views(self) -> "list[Camera]":
+        if self.render_mode is None:
+            return []
+        from sb3_robust_bisim.envs.camera import Camera
+
+        return [Camera(self.physics, self.camera_id, self._render_size)]
 
     def _observe(self, state: dict[str, Any], info: dict[str, Any]) -> np.ndarray:
         return np.asarray(flatten(self._state_space, state), dtype=np.float32)

@@ -1,6 +1,6 @@
 """The tasks of the DeepMind Control Suite from pixels, with or without distractors in the background."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -9,6 +9,9 @@ from sb3_robust_bisim.envs.distractors import check_distractor, make_distractor
 from sb3_robust_bisim.envs.dmc import MAX_SIZE, SuiteTask, check_integer, check_task
 from sb3_robust_bisim.envs.opengl import import_suite
 from sb3_robust_bisim.envs.video import SplitClipFiles
+
+if TYPE_CHECKING:
+    from sb3_robust_bisim.envs.camera import Camera
 
 
 class PixelTask(SuiteTask):
@@ -73,19 +76,24 @@ class PixelTask(SuiteTask):
         check_integer("size", size, MAX_SIZE)
         check_distractor(distractor, distractor_files, split, grayscale)
         import_suite(rendering=True)
-        from sb3_robust_bisim.envs.camera import Camera, KeyCamera
-
-        self.distractor = make_distractor(distractor, size, distractor_files, split, grayscale=grayscale, cache_dir=cache_dir)
-        super().__init__(domain, task, action_repeat, camera_id, render_mode, render_size)
-        max_size = size if render_mode is None else max(size, render_size)
-        if self.distractor is None or clean_obs:
-            self._views.append(Camera(self.physics, self.camera_id, max_size, effects=shadows))
-        if self.distractor is not None:
-            # Last, so that it shows what the agent sees
-            self._views.append(KeyCamera(self.physics, self.camera_id, max_size, self.distractor, own_context=clean_obs))
         self._size = size
         self._clean_obs = clean_obs
+        self._shadows = shadows
+        self.distractor = make_distractor(distractor, size, distractor_files, split, grayscale=grayscale, cache_dir=cache_dir)
+        super().__init__(domain, task, action_repeat, camera_id, render_mode, render_size)
         self.observation_space = gym.spaces.Box(0, 255, shape=(size, size, 3), dtype=np.uint8)
+
+    def _make_views(self) -> "list[Camera]":
+        from sb3_robust_bisim.envs.camera import Camera, KeyCamera
+
+        max_size = self._size if self.render_mode is None else max(self._size, self._render_size)
+        views: list[Camera] = []
+        if self.distractor is None or self._clean_obs:
+            views.append(Camera(self.physics, self.camera_id, max_size, effects=self._shadows))
+        if self.distractor is not None:
+            # Last, so that it shows what the agent sees
+            views.append(KeyCamera(self.physics, self.camera_id, max_size, self.distractor, own_context=self._clean_obs))
+        return views
 
     def _observe(self, state: dict[str, Any], info: dict[str, Any]) -> np.ndarray:
         frame = self._views[-1].frame(self._size)

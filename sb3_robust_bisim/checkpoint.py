@@ -1,0 +1,136 @@
+"""
+Checkpoints from which training goes on as if it had never stopped.
+
+SB3's own ``save`` keeps the agent. Here everything goes into one file that the next number depends on: agent and optimizers,
+replay buffer, environments in the middle of their episodes, callbacks with what they have gathered, and the random generators.
+Learning then gives the same numbers, bit by bit, as a run that was never interrupted. What differs: the wall-clock times,
+and the first line of every output of SB3's logger, whose means begin anew.
+"""
+
+import inspect
+import random
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.monitor import ResultsWriter
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnvWrapper
+
+from sb3_robust_bisim.atomic import atomic_path
+
+
+class Checkpoint(BaseCallback):
+    """
+    Writes a checkpoint every so often, between two rollouts, over the one before.
+
+    :param path: file to write; it is replaced as a whole
+    :param every: environment steps between two checkpoints, all environments together, >= 1
+    :param context: anything else to keep, under the same roof: objects shared with the model stay shared
+    :raises ValueError: for ``every`` < 1; at the start of training, for environments in processes of their own
+    """
+
+    def __init__(self, path: str | Path, every: int, context: Any = None) -> None:
+        super().__init__()
+        if every < 1:
+            raise ValueError(f"every={every}: there must be at least one step between two checkpoints.")
+        self.path = Path(path)
+        self.every = every
+        self.context = context
+        self._last = 0
+
+    def _on_training_start(self) -> None:
+        if isinstance(self.training_env.unwrapped, SubprocVecEnv):
+            raise ValueError("SubprocVecEnv keeps its environments in other processes: use DummyVecEnv (--vec-env dummy).")
+        self._last = self.num_timesteps
+
+    def _on_rollout_start(self) -> None:
+        if self.num_timesteps - self._last >= self.every:
+            self._last = self.num_timesteps
+            save_checkpoint(self.path, self.model, self.context)
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def save_checkpoint(path: str | Path, model: BaseAlgorithm, context: Any = None) -> None:
+    """
+    :param path: file to write; an old one stays whole until the new one is
+    :param model: between two calls of ``collect_rollouts``, as in :class:`Checkpoint`
+    :param context: anything else to keep
+    """
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        _Pickler(file).dump((model, context, _generator_states()))
+
+
+def load_checkpoint(path: str | Path) -> tuple[Any, Any]:
+    """
+    Bring back a model, and set the global random generators to where they stood.
+
+    Only load files that you trust: unpickling runs code. Learn on with ``reset_num_timesteps=False``.
+
+    :param path: what :func:`save_checkpoint` wrote, with the same versions of the packages
+    :return: the model with its environments and its replay buffer, and the context
+    """
+    with Path(path).open("rb") as file:
+        model, context, (python, numpy, torch, cuda) = cloudpickle.load(file)
+    random.setstate(python)
+    np.random.set_state(numpy)  # noqa: NPY002 (SB3 samples with it)
+    th.set_rng_state(torch)
+    if cuda:
+        th.cuda.set_rng_state_all(cuda)
+    return model, context
+
+
+def _generator_states() -> tuple[Any, ...]:
+    cuda = th.cuda.get_rng_state_all() if th.cuda.is_available() else []
+    return random.getstate(), np.random.get_state(), th.get_rng_state(), cuda  # noqa: NPY002
+
+
+class _Pickler(cloudpickle.Pickler):
+    """Takes out what belongs to a process and is made anew when training goes on."""
+
+    def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, Logger):  # open files; learn() makes another
+            return type(None), ()
+        if isinstance(obj, ProgressBarCallback):  # a bar on the screen
+            return ProgressBarCallback, ()
+        if isinstance(obj, BaseCallback):  # the local and global variables of learn()
+            return _bare, (type(obj), {"locals": {}, "globals": {}}), _without(obj, "locals", "globals"), None, None, _fill
+        if isinstance(obj, VecEnvWrapper):  # the members of its class; VecNormalize would leave out its environment as well
+            return _bare_wrapper, (type(obj),), _without(obj, "class_attributes"), None, None, _fill
+        if isinstance(obj, ResultsWriter):
+            obj.file_handler.flush()
+            return _reopen, (obj.file_handler.name, obj.file_handler.tell(), tuple(obj.logger.fieldnames)[3:])
+        return super().reducer_override(obj)
+
+
+def _without(obj: Any, *names: str) -> dict[str, Any]:
+    return {name: value for name, value in vars(obj).items() if name not in names}
+
+
+def _fill(obj: Any, state: dict[str, Any]) -> None:
+    vars(obj).update(state)
+
+
+def _bare(cls: type, state: dict[str, Any]) -> Any:
+    obj = cls.__new__(cls)
+    _fill(obj, state)
+    return obj
+
+
+def _bare_wrapper(cls: type) -> Any:
+    return _bare(cls, {"class_attributes": dict(inspect.getmembers(cls))})
+
+
+def _reopen(name: str, size: int, extra_keys: tuple[str, ...]) -> ResultsWriter:
+    """The file of a Monitor, without the episodes that ended after the checkpoint: they will end again."""
+    path = Path(name)
+    if path.exists():
+        with path.open("r+b") as file:
+            file.truncate(size)
+    return ResultsWriter(name, extra_keys=tuple(extra_keys), override_existing=False)

@@ -32,7 +32,7 @@ train-pixels: setup  ## a few minutes of cartpole-swingup from pixels with video
 		--tensorboard-log logs/tensorboard
 
 test: setup  ## all tests
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 SB3_TESTS := run save_load cnn train_eval_mode her dict_env vec_normalize callbacks predict sde spaces deterministic \
 	custom_policy tensorboard gae

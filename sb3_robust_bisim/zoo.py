@@ -142,7 +142,8 @@ class BisimExperimentManager(ExperimentManager):
     def _settings(self, hyperparams: dict[str, Any]) -> dict[str, Any]:
         """What must be the same for a run to be continued; it may become longer."""
         env_kwargs = {"env_kwargs": self.env_kwargs or hyperparams.get("env_kwargs", {})}
-        return {"env": self.env_name, "seed": self.seed, **hyperparams, **env_kwargs, "n_timesteps": None}
+        seed = self.seed if "--seed" in sys.argv else "random"  # the zoo draws one
+        return {"env": self.env_name, "seed": seed, **hyperparams, **env_kwargs, "n_timesteps": None}
 
     def _continue(self, checkpoint: Path) -> tuple[BaseAlgorithm, dict[str, Any]]:
         hyperparams, saved_hyperparams = self.read_hyperparameters()

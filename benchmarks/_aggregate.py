@@ -1,0 +1,172 @@
+"""Curves and tables of a figure: mean and standard error as in the paper, and rliable's interquartile mean with intervals."""
+
+import csv
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from _figures import Figure
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Picture
+from rliable import library, metrics
+
+from sb3_robust_bisim.atomic import atomic_path
+
+# arch, which draws rliable's samples, does not like the kind of generator that rliable gives it
+warnings.filterwarnings("ignore", "random_state is deprecated", FutureWarning)
+
+Result = dict[str, Any]
+Curve = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # steps, middle, low, high
+REPS = 1000  # bootstrap samples
+FULL = "normed-IR-ID"
+
+
+def of(results: list[Result], **wanted: Any) -> list[Result]:
+    return [result for result in results if result.items() >= wanted.items()]
+
+
+def series(runs: list[Result], key: str) -> tuple[np.ndarray, np.ndarray]:
+    """Steps and (runs, evaluations) values, as far as all runs have got; "return" is the mean of the episodes."""
+    length = min(len(run["evaluations"]) for run in runs)
+    rows = [
+        [np.mean(e["returns"]) if key == "return" else e.get(key, np.nan) for e in run["evaluations"][:length]] for run in runs
+    ]
+    return np.array([evaluation["step"] for evaluation in runs[0]["evaluations"][:length]]), np.array(rows, dtype=float)
+
+
+def mean_curve(runs: list[Result], key: str) -> Curve:
+    steps, values = series(runs, key)
+    middle = values.mean(axis=0)
+    error = values.std(axis=0, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.zeros_like(middle)
+    return steps, middle, middle - error, middle + error
+
+
+def iqm_curve(runs: list[Result], key: str) -> Curve:
+    steps, values = series(runs, key)
+    scores = {"": values[:, None, :]}  # runs, tasks, evaluations
+
+    def iqm(x: np.ndarray) -> np.ndarray:
+        return np.array([metrics.aggregate_iqm(x[..., i]) for i in range(x.shape[-1])])
+
+    middle, intervals = library.get_interval_estimates(scores, iqm, reps=REPS // 5, random_state=np.random.RandomState(0))
+    return steps, middle[""], *intervals[""]
+
+
+def median_curve(runs: list[Result], key: str) -> Curve:
+    """Median and range: what grows without bound has no useful mean."""
+    steps, values = series(runs, key)
+    return steps, np.median(values, axis=0), values.min(axis=0), values.max(axis=0)
+
+
+def ratio_curve(runs: list[Result], key: str) -> Curve:
+    (steps, mu_bd), (_, mu_rd) = series(runs, "mu_bd"), series(runs, "mu_rd")
+    middle = np.nanmean(np.divide(mu_bd, mu_rd, out=np.full_like(mu_bd, np.nan), where=mu_rd > 0), axis=0)
+    return steps, middle, middle, middle
+
+
+# Row of a figure: the curve, what it is drawn from, the label of its axis and its scale
+QUANTITIES: dict[str, tuple[Callable[[list[Result], str], Curve], str, str, str]] = {
+    "mean_return": (mean_curve, "return", "return, mean ± standard error", "linear"),
+    "iqm_return": (iqm_curve, "return", "return, IQM, 95 % interval", "linear"),
+    "embedding_norm_max": (median_curve, "embedding_norm_max", "largest norm, median and range", "log"),
+    "mu_ratio": (ratio_curve, "mu_bd", "$\\mu_{bd} / \\mu_{rd}$", "log"),
+}
+
+
+def draw(results: list[Result], figure: Figure, out: Path) -> None:
+    """``curves.png`` and ``curves.csv``: one column of axes per task, one row per quantity."""
+    panels = [panel for panel in figure.panels if of(results, panel=panel)]
+    picture = Picture(figsize=(1.5 + 4.2 * len(panels), 0.8 + 3.2 * len(figure.rows)), layout="constrained")
+    axes = picture.subplots(len(figure.rows), len(panels), squeeze=False, sharex=True)
+    table: list[list[Any]] = [["quantity", "panel", "method", "runs", "step", "middle", "low", "high"]]
+    for row, quantity in enumerate(figure.rows):
+        for column, panel in enumerate(panels):
+            for color, method in enumerate(figure.methods):
+                if runs := of(results, panel=panel, method=method):
+                    curve, key, _, _ = QUANTITIES[quantity]
+                    lines = curve(runs, key)
+                    _draw_curve(axes[row, column], lines, f"{method} ({len(runs)})", f"C{color}")
+                    values = zip(*lines, strict=True)
+                    table += [[quantity, panel, method, len(runs), *(f"{v:.6g}" for v in point)] for point in values]
+            _label(axes[row, column], quantity, panel if row == 0 else "", column == 0)
+    for column in range(len(panels)):
+        axes[-1, column].set_xlabel("environment steps")
+    handles = {label: line for ax in axes.flat for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    picture.legend(handles.values(), handles, loc="outside lower center", ncols=min(len(handles), 4), title="method (runs)")
+    with atomic_path(out / "curves.png") as temporary:
+        picture.savefig(temporary, dpi=90, format="png")
+    with atomic_path(out / "curves.csv") as temporary, temporary.open("w", newline="") as file:
+        csv.writer(file).writerows(table)
+
+
+def _draw_curve(ax: Axes, curve: Curve, label: str, color: str) -> None:
+    steps, middle, low, high = curve
+    ax.plot(steps, middle, label=label, color=color)
+    ax.fill_between(steps, low, high, color=color, alpha=0.2)
+
+
+def _label(ax: Axes, quantity: str, title: str, first: bool) -> None:
+    _, _, label, scale = QUANTITIES[quantity]
+    ax.set(
+        title=title,
+        yscale=scale if ax.dataLim.y1 > 0 else "linear",  # nothing measured yet has no logarithm
+        ylabel=label if first else "",
+    )
+    ax.grid(alpha=0.3)
+
+
+def tables(results: list[Result], figure: Figure, out: Path) -> dict[str, Any]:
+    """``table.md``: where each method ended; and the same for the closing JSON."""
+    panels: dict[str, dict[str, Any]] = {}
+    for panel in figure.panels:
+        ends = {m: series(runs, "return")[1][:, -1] for m in figure.methods if (runs := of(results, panel=panel, method=m))}
+        panels[panel] = {m: _ending(of(results, panel=panel, method=m), final, ends.get(FULL)) for m, final in ends.items()}
+    lines = [
+        "| task | method | runs | last return ± s.e. | IQM [95 %] | P(full is better) [95 %] | largest norm | minutes |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for panel, methods in panels.items():
+        for method, row in methods.items():
+            better = "" if method == FULL or "full_is_better" not in row else "{} [{}, {}]".format(*row["full_is_better"])
+            iqm, low, high = row["iqm"]
+            lines.append(
+                f"| {panel} | {method} | {row['runs']} | {row['mean']} ± {row['standard_error']} | {iqm} [{low}, {high}] "
+                f"| {better} | {row['largest_norm']} | {row['minutes']} |"
+            )
+    measured = sorted({f"commit {r['commit']}, {r['machine']}, torch {r['versions']['torch']}" for r in results})
+    seeds = sorted({r["seed"] for r in results})
+    lines += ["", f"Seeds {seeds[0]} to {seeds[-1]}; {'; '.join(measured)}.", ""]
+    with atomic_path(out / "table.md") as temporary:
+        temporary.write_text("\n".join(lines))
+    return {"panels": panels}
+
+
+def _ending(runs: list[Result], final: np.ndarray, full: np.ndarray | None) -> dict[str, Any]:
+    estimate = library.get_interval_estimates
+    generator = np.random.RandomState(0)
+    iqm, interval = estimate(
+        {"": final[:, None]}, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=REPS, random_state=generator
+    )
+    row: dict[str, Any] = {
+        "runs": len(final),
+        "mean": _short(final.mean()),
+        "standard_error": _short(final.std(ddof=1) / np.sqrt(len(final)) if len(final) > 1 else np.nan),
+        "iqm": [_short(value) for value in (iqm[""][0], *interval[""][:, 0])],
+        "final_returns": [_short(value) for value in final],
+        "largest_norm": _short(max(e.get("embedding_norm_max", 0.0) for run in runs for e in run["evaluations"])),
+        "minutes": _short(np.median([run["seconds"] for run in runs]) / 60),
+        "stopped": sum("stopped" in run for run in runs),
+    }
+    if full is not None:
+        pair = {"": (full[:, None], final[:, None])}
+        better, interval = estimate(pair, metrics.probability_of_improvement, reps=REPS, random_state=generator)
+        row["full_is_better"] = [_short(value) for value in (better[""], *np.ravel(interval[""]))]
+    for split in runs[0].get("final_return_by_split", {}):
+        row[f"final_return_{split}"] = [_short(np.mean(run["final_return_by_split"][split])) for run in runs]
+    return row
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.3g}") if abs(value) < 1000 else round(float(value))

@@ -1,0 +1,110 @@
+"""What the figures of the paper compare: tasks, methods, seeds and steps. The settings are those of zoo_configs/."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+CARTPOLE = "robust_bisim/SparseCartPole-v0"
+MOUNTAIN_CAR = "robust_bisim/MountainCarContinuous-v0"
+PENDULUM = "robust_bisim/SparsePendulum-v0"
+SWINGUP_PIXELS = "robust_bisim/cartpole-swingup-pixels-v0"
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A task: environment, its arguments in place of the configuration's (none: as there), and variants laid over it."""
+
+    env_id: str
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    variants: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Method:
+    """Variants of zoo_configs/bisim_sac.yml and what is laid over them; ``panels``: where it is run (none: everywhere)."""
+
+    variants: tuple[str, ...]
+    params: dict[str, Any] = field(default_factory=dict)
+    panels: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Figure:
+    """
+    :param rows: what is drawn over the steps, keys of ``_aggregate.QUANTITIES``
+    :param seconds_per_1000_steps: of one run on one core, until finished runs tell better
+    :param splits: clips on which the final agent is played, for video
+    """
+
+    panels: dict[str, Panel]
+    methods: dict[str, Method]
+    seeds: int
+    steps: int
+    eval_freq: int
+    eval_episodes: int
+    seconds_per_1000_steps: float
+    rows: tuple[str, ...] = ("mean_return", "iqm_return", "embedding_norm_max")
+    splits: tuple[str, ...] = ()
+
+
+def _variants(*names: str, **params: Any) -> dict[str, Method]:
+    return {name: Method((name,), params) for name in names}
+
+
+def _noisy(env_id: str, *multipliers: int) -> dict[str, Panel]:
+    return {f"N_m={n}": Panel(env_id, {"noise_multiplier": n}) for n in multipliers}
+
+
+# The published code clamps the bonus before it scales it: R_max_I = 20 * 0.1 in the paper's form
+_CLAMPED_BEFORE_SCALING = {
+    f"{name}-clamp2": Method((name,), {"intrinsic_reward_max": 2.0}) for name in ("DBC-IR", "normed-IR", "normed-IR-ID")
+}
+_HALF = {"c_t": 0.5}
+
+FIGURES = {
+    "cartpole": Figure(
+        _noisy(CARTPOLE, 0, 1, 2, 3),
+        {
+            **_variants("SAC", "DBC", "DBC-normed", "normed-IR", "normed-ID", "normed-IR-ID"),
+            "self-prediction": Method(("self-prediction",), panels=("N_m=2", "N_m=3")),
+        },
+        *(5, 10_000, 500, 10, 17),
+    ),
+    "mountain_car": Figure(
+        _noisy(MOUNTAIN_CAR, 1, 2),
+        {**_variants("SAC", "DBC-IR", "DBC-normed", "normed-IR", "normed-IR-ID"), **_CLAMPED_BEFORE_SCALING},
+        *(5, 20_000, 1000, 10, 20),
+    ),
+    "pendulum": Figure(_noisy(PENDULUM, 10), _variants("SAC", "DBC", "normed-IR-ID"), *(3, 30_000, 1000, 10, 17)),
+    "dbc_alt": Figure(_noisy(CARTPOLE, 0, 2), _variants("DBC", "DBC-alt"), *(5, 10_000, 500, 10, 17)),
+    "theory": Figure(
+        _noisy(CARTPOLE, 2),
+        {
+            **_variants("DBC", "DBC-normed", "DBC-alt"),
+            "DBC-half": Method(("DBC",), _HALF),
+            "DBC-half-l1": Method(("DBC",), {**_HALF, "distance": "l1"}),
+            "DBC-half-l2": Method(("DBC",), {**_HALF, "distance": "l2"}),
+            "DBC-normed-half": Method(("DBC-normed",), _HALF),
+        },
+        *(1, 4000, 500, 10, 17),
+        rows=("embedding_norm_max", "mu_ratio"),
+    ),
+    "dmc_state": Figure(
+        {
+            "cheetah-run": Panel("robust_bisim/cheetah-run-v0"),
+            "cartpole-swingup_sparse": Panel("robust_bisim/cartpole-swingup_sparse-v0"),
+        },
+        _variants("SAC", "DBC", "normed-IR-ID"),
+        *(3, 160_000, 8000, 5, 3),
+    ),
+    "dmc_pixels": Figure(
+        {"video": Panel(SWINGUP_PIXELS, variants=("small",)), "clean": Panel(SWINGUP_PIXELS, variants=("clean", "small"))},
+        _variants("SAC", "normed-IR-ID"),
+        *(2, 65_000, 4000, 5, 25),
+        splits=("train", "eval"),
+    ),
+    "bf16": Figure(
+        _noisy(CARTPOLE, 2),
+        {"fp32": Method(("normed-IR-ID",)), "bf16": Method(("normed-IR-ID",), {"bf16": True})},
+        *(2, 10_000, 500, 10, 17),
+    ),
+}

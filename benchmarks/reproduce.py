@@ -1,0 +1,295 @@
+"""
+Repeat a figure of the paper: every method, task and seed through the zoo's command line, then curves and tables.
+
+Each run trains with zoo_configs/bisim_sac.yml and leaves one JSON file in benchmarks/results/FIGURE. A finished run is not run
+again, an interrupted one goes on from its checkpoint, exactly. --dry-run shows the commands. The last line printed is one JSON
+object.
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import shlex
+import shutil
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # runs are spread over processes, one thread each
+
+import joblib
+import numpy as np
+from _aggregate import draw, tables
+from _figures import FIGURES, Figure, Method, Panel
+from _machine import machine
+from rl_zoo3.utils import StoreDict
+from tqdm import tqdm
+
+ROOT = Path(__file__).resolve().parent
+CONFIG = ROOT.parent / "zoo_configs" / "bisim_sac.yml"
+LOGGED = ("embedding_norm_mean", "embedding_norm_max", "mu_bd", "mu_rd")
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One curve of one seed."""
+
+    figure: str
+    panel_name: str
+    method_name: str
+    panel: Panel
+    method: Method
+    seed: int
+    steps: int
+    eval_freq: int
+    eval_episodes: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.panel_name.replace('=', '')}_{self.method_name}_seed{self.seed}"
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What a result must agree with to be this run's."""
+        return {
+            "figure": self.figure,
+            "panel": self.panel_name,
+            "method": self.method_name,
+            "env": self.panel.env_id,
+            "env_kwargs": self.panel.env_kwargs,
+            "variants": [*self.method.variants, *self.panel.variants],
+            "params": self.method.params,
+            "seed": self.seed,
+            "steps": self.steps,
+            "eval_freq": self.eval_freq,
+            "eval_episodes": self.eval_episodes,
+        }
+
+    def command(self, folder: Path) -> list[str]:
+        """What follows ``python -m sb3_robust_bisim``."""
+        return [
+            *("train", "--env", self.panel.env_id, "--variant", *self.method.variants, *self.panel.variants),
+            *("--conf-file", str(CONFIG), "--seed", str(self.seed), "--n-timesteps", str(self.steps)),
+            *("--eval-freq", str(self.eval_freq), "--eval-episodes", str(self.eval_episodes)),
+            *("--log-interval", "1", "--verbose", "0", "--num-threads", "1", "--log-folder", str(folder)),
+            *("--tensorboard-log", str(folder / "tensorboard")),
+            *("--checkpoint", str(folder / "checkpoint.pkl"), "--checkpoint-freq", str(self.eval_freq)),
+            *_store_dict("--env-kwargs", self.panel.env_kwargs),
+            *_store_dict("-params", self.method.params),
+        ]
+
+
+def _store_dict(option: str, values: dict[str, Any]) -> list[str]:
+    return [option, *(f"{key}:{value!r}" for key, value in values.items())] if values else []
+
+
+def runs_of(name: str, figure: Figure, args: argparse.Namespace) -> list[Run]:
+    """All runs of a figure, seed by seed, so that an early look compares all methods."""
+    steps = args.steps or figure.steps
+    return [
+        Run(
+            *(name, panel_name, method_name, panel, replace(method, params={**method.params, **args.params}), seed, steps),
+            *(min(args.eval_freq or figure.eval_freq, steps), figure.eval_episodes),
+        )
+        for seed in range(args.seeds or figure.seeds)
+        for panel_name, panel in figure.panels.items()
+        for method_name, method in figure.methods.items()
+        if panel_name in (args.panels or figure.panels)
+        and method_name in (args.methods or figure.methods)
+        and panel_name in (method.panels or figure.panels)
+    ]
+
+
+# --- what a worker does; it reaches other machines by value, and imports only what is installed there
+
+
+def finished(path: Path, identity: dict[str, Any]) -> dict[str, Any] | None:
+    """The result of a run that has ended, if the file holds the one asked for."""
+    result = json.loads(path.read_text()) if path.exists() else {}
+    return result if result.items() >= identity.items() else None
+
+
+def train(command: list[str], folder: Path, result_path: Path, identity: dict, measured: dict, splits: tuple) -> dict:
+    """One run, from its checkpoint if it has one, or its result if it has ended."""
+    from filelock import FileLock
+
+    from sb3_robust_bisim.atomic import atomic_path
+    from sb3_robust_bisim.zoo import main
+
+    folder.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder.with_suffix(".lock")):  # a scheduler may take a worker for dead that is not
+        if result := finished(result_path, identity):
+            return result
+        if not (folder / "checkpoint.pkl").exists():
+            shutil.rmtree(folder)
+            folder.mkdir()
+            (folder / "measured.json").write_text(json.dumps(measured))
+        stopped = {}
+        with (folder / "log.txt").open("a") as log, contextlib.redirect_stdout(log):
+            try:
+                main(command)
+            except ValueError as error:  # an embedding that explodes may end in a loss that is not finite: a result too
+                if "training has stopped" not in str(error):
+                    raise
+                stopped = {"stopped": str(error)}
+        result = {**identity, **json.loads((folder / "measured.json").read_text()), **stopped, **collect(folder)}
+        if not stopped and steps_of(result)[-1] + identity["eval_freq"] < identity["steps"]:
+            raise KeyboardInterrupt  # the zoo ends such a run as if it were complete
+        if splits and not stopped:
+            result["final_return_by_split"] = {split: play(folder, identity, split) for split in splits}
+        with atomic_path(result_path) as temporary:
+            temporary.write_text(json.dumps(result, indent=None).replace('{"step"', '\n{"step"') + "\n")
+        return result
+
+
+def steps_of(result: dict[str, Any]) -> list[int]:
+    return [evaluation["step"] for evaluation in result["evaluations"]]
+
+
+def collect(folder: Path) -> dict[str, Any]:
+    """What the zoo and TensorBoard have recorded of a run, evaluation by evaluation."""
+    import yaml
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    (run,) = (folder / "bisim_sac").glob("*_1")
+    arguments = yaml.unsafe_load(next(run.glob("*/config.yml")).read_text())
+    with np.load(run / "evaluations.npz") as archive:
+        steps, returns = archive["timesteps"], archive["results"]
+    logged: dict[str, dict[int, float]] = {name: {} for name in LOGGED}
+    seconds = 0.0
+    for path in sorted((folder / "tensorboard").rglob("events.*")):
+        events = EventAccumulator(str(path), size_guidance={"scalars": 0})
+        events.Reload()
+        tags = events.Tags()["scalars"]
+        times = [event.wall_time for tag in tags[:1] for event in events.Scalars(tag)]
+        seconds += max(times, default=0) - events.FirstEventTimestamp() if times else 0
+        for name in LOGGED:
+            if f"bisim/{name}" in tags:
+                logged[name].update((event.step, event.value) for event in events.Scalars(f"bisim/{name}"))
+    evaluations = []
+    for start, end, values in zip([0, *steps[:-1]], steps, returns, strict=True):
+        between = {name: [v for step, v in series.items() if start < step <= end] for name, series in logged.items()}
+        means = {name: float(f"{np.mean(values):.5g}") for name, values in between.items() if values}
+        if between["embedding_norm_max"]:
+            means["embedding_norm_max"] = float(f"{max(between['embedding_norm_max']):.5g}")
+        evaluations.append({"step": int(end), "returns": np.round(values, 3).tolist(), **means})
+    settings = {key: value for key, value in arguments.items() if key not in ("env_kwargs", "variants", "n_timesteps")}
+    return {"arguments": settings, "seconds": round(seconds), "evaluations": evaluations}
+
+
+def play(folder: Path, identity: dict, split: str, n_episodes: int = 20) -> list[float]:
+    """Returns of the final agent in front of the clips of one split."""
+    import yaml
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.evaluation import evaluate_policy
+    from stable_baselines3.common.vec_env import VecFrameStack
+
+    from sb3_robust_bisim import BisimSAC
+
+    (run,) = (folder / "bisim_sac").glob("*_1")
+    arguments = yaml.unsafe_load(next(run.glob("*/config.yml")).read_text())
+    kwargs = {**arguments["env_kwargs"], "split": split}
+    venv = VecFrameStack(make_vec_env(identity["env"], 1, seed=10_000, env_kwargs=kwargs), n_stack=3)
+    model = BisimSAC.load(next(run.glob("robust_bisim-*.zip")), env=venv, buffer_size=1)
+    returns, _ = evaluate_policy(model, model.get_env(), n_episodes, return_episode_rewards=True)  # type: ignore[arg-type]
+    venv.close()
+    return np.round(returns, 3).tolist()
+
+
+# --- the sweep
+
+
+def seconds_left(todo: list[Run], results: list[dict], figure: Figure) -> float:
+    """Of all runs on one core, after the finished ones of the same method, or of any."""
+
+    def per_step(method: str) -> float:
+        known = [r["seconds"] / steps_of(r)[-1] for r in results if r["method"] == method and r["seconds"] > 0]
+        known = known or [r["seconds"] / steps_of(r)[-1] for r in results if r["seconds"] > 0]
+        return float(np.median(known)) if known else figure.seconds_per_1000_steps / 1000
+
+    return sum(per_step(run.method_name) * run.steps for run in todo)
+
+
+def backend(args: argparse.Namespace) -> Any:
+    if args.backend == "dask":
+        return joblib.parallel_config(backend="dask", n_jobs=-1, scheduler_host=args.scheduler, wait_for_workers_timeout=60)
+    return joblib.parallel_config(backend="loky", n_jobs=args.jobs)
+
+
+def sweep(todo: list[Run], args: argparse.Namespace, splits: tuple[str, ...], done: int) -> None:
+    measured = machine()  # the code that the workers load, whatever is committed while they run
+    work, out = args.work.resolve(), args.out.resolve()
+    tasks = [
+        joblib.delayed(train)(
+            run.command(work / run.figure / run.name),
+            *(work / run.figure / run.name, out / run.figure / f"{run.name}.json"),
+            *(run.identity, measured, splits),
+        )
+        for run in todo
+    ]
+    with tqdm(total=done + sum(run.steps for run in todo), initial=done, unit="step", file=sys.stderr) as bar, backend(args):
+        for result in joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="all")(tasks):
+            bar.set_postfix_str(f"{result['panel']} {result['method']} seed {result['seed']}")
+            bar.update(result["steps"])
+
+
+def parse_arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("figure", choices=FIGURES)
+    parser.add_argument("--seeds", type=int, help="how many (default: the figure's)")
+    parser.add_argument("--steps", type=int, help="of the environment per run (default: the figure's)")
+    parser.add_argument("--eval-freq", type=int, help="steps between evaluations and checkpoints (default: the figure's)")
+    parser.add_argument(
+        "--params", nargs="+", action=StoreDict, default={}, help="for all methods, batch_size:128 for example"
+    )
+    parser.add_argument("--panels", nargs="+", help="some of the tasks, N_m=2 for example (default: all)")
+    parser.add_argument("--methods", nargs="+", help="some of the methods (default: all)")
+    parser.add_argument("--jobs", type=int, default=joblib.cpu_count(), help="local processes (default: %(default)s)")
+    parser.add_argument("--backend", choices=("loky", "dask"), default="loky", help="local processes, or a Dask cluster")
+    parser.add_argument("--scheduler", help="address of the Dask scheduler, host:port; its workers need --nthreads 1")
+    parser.add_argument("--out", type=Path, default=ROOT / "results", help="results (default: benchmarks/results)")
+    parser.add_argument("--work", type=Path, default=Path("logs/reproduce"), help="run folders (default: %(default)s)")
+    parser.add_argument("--dry-run", action="store_true", help="show the commands and how long they should take")
+    parser.add_argument("--only-draw", action="store_true", help="curves and tables of the runs that have ended")
+    args = parser.parse_args()
+    figure = FIGURES[args.figure]
+    for option, known in (("panels", figure.panels), ("methods", figure.methods)):
+        if unknown := set(getattr(args, option) or ()) - set(known):
+            parser.error(f"--{option} {' '.join(unknown)}: {args.figure} has {', '.join(known)}.")
+    for option in ("seeds", "steps", "eval_freq", "jobs"):
+        if (value := getattr(args, option)) is not None and value < 1:
+            parser.error(f"--{option.replace('_', '-')} {value}: must be at least 1.")
+    if (args.backend == "dask") != (args.scheduler is not None):
+        parser.error("--backend dask and --scheduler ADDRESS belong together.")
+    return args
+
+
+def main() -> None:
+    args = parse_arguments()
+    figure = FIGURES[args.figure]
+    out = args.out / args.figure
+    runs = runs_of(args.figure, figure, args)
+    results = {run: result for run in runs if (result := finished(out / f"{run.name}.json", run.identity))}
+    todo = [run for run in runs if run not in results]
+    hours = seconds_left(todo, list(results.values()), figure) / 3600
+    left = f"the rest takes {hours:.1f} hours of one core" if todo else "nothing is left to run"
+    print(f"{len(results)} of {len(runs)} runs have ended; {left}.", file=sys.stderr)
+    if args.dry_run:
+        for run in todo:
+            command = run.command(args.work / run.figure / run.name)
+            print(shlex.join(["python", "-m", "sb3_robust_bisim", *command]).replace(f"{Path.cwd()}/", ""))
+        return
+    if todo and not args.only_draw:
+        sweep(todo, args, figure.splits, sum(run.steps for run in results))
+    results = {run: result for run in runs if (result := finished(out / f"{run.name}.json", run.identity))}
+    if not results:
+        sys.exit("No run has ended yet.")
+    draw(list(results.values()), figure, out)
+    summary = tables(list(results.values()), figure, out)
+    print(json.dumps({"benchmark": "reproduce", "figure": args.figure, "runs": len(results), "of": len(runs), **summary}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""Training that goes on from a checkpoint ends exactly as training that was never interrupted."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch as th
+from small_models import SMALL
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecFrameStack, VecNormalize
+
+from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer, IntrinsicRewardVecEnv, zoo
+from sb3_robust_bisim.checkpoint import Checkpoint, load_checkpoint
+
+STEPS = 120
+LEARNING = {**SMALL, "learning_starts": 20, "buffer_size": 200}
+
+
+class StopAt(BaseCallback):
+    """Ends training at a step, as a kill would: what comes after the last checkpoint is lost."""
+
+    def __init__(self, step: int) -> None:
+        super().__init__()
+        self.step = step
+
+    def _on_step(self) -> bool:
+        return self.num_timesteps < self.step
+
+
+def state_task() -> VecEnv:
+    venv = make_vec_env("robust_bisim/cheetah-run-v0", 2, seed=3, env_kwargs=dict(noise_multiplier=1, action_repeat=40))
+    return VecNormalize(IntrinsicRewardVecEnv(venv), norm_reward=False)
+
+
+def pixel_task() -> VecEnv:
+    kwargs = dict(distractor="video", size=16, action_repeat=40)
+    return VecFrameStack(make_vec_env("robust_bisim/cartpole-swingup-pixels-v0", 2, seed=3, env_kwargs=kwargs), n_stack=3)
+
+
+def model_of(task: str) -> BisimSAC:
+    if task == "state":
+        return BisimSAC("MlpPolicy", state_task(), **LEARNING)
+    return BisimSAC("CnnPolicy", pixel_task(), replay_buffer_class=FrameStackReplayBuffer, **LEARNING)
+
+
+@pytest.mark.parametrize("task", ["state", "pixels"])
+def test_training_goes_on_as_if_it_had_never_stopped(task: str, tmp_path: Path) -> None:
+    expected = model_of(task).learn(STEPS)
+
+    interrupted = model_of(task)
+    interrupted.learn(STEPS, callback=CallbackList([Checkpoint(tmp_path / "checkpoint.pkl", 50), StopAt(90)]))
+    set_random_seed(99)  # another process has other generators
+    model, _ = load_checkpoint(tmp_path / "checkpoint.pkl")
+    assert 50 <= model.num_timesteps < 90
+    model.learn(STEPS - model.num_timesteps, reset_num_timesteps=False)
+
+    assert model.num_timesteps == expected.num_timesteps
+    for name, tensor in expected.policy.state_dict().items():
+        assert th.equal(tensor, model.policy.state_dict()[name]), name
+    np.testing.assert_array_equal(model.replay_buffer.rewards, expected.replay_buffer.rewards)
+    np.testing.assert_array_equal(model.env.reset(), expected.env.reset())
+
+
+def test_a_monitor_file_has_each_episode_once(tmp_path: Path) -> None:
+    def model(folder: Path) -> BisimSAC:
+        venv = make_vec_env("robust_bisim/SparseCartPole-v0", 1, seed=3, monitor_dir=str(folder))
+        return BisimSAC("MlpPolicy", venv, **LEARNING)
+
+    def episodes(folder: Path) -> list[tuple[str, ...]]:
+        return [tuple(line.split(",")[:2]) for line in (folder / "0.monitor.csv").read_text().splitlines()[1:]]
+
+    model(tmp_path / "a").learn(STEPS)
+    model(tmp_path / "b").learn(STEPS, callback=CallbackList([Checkpoint(tmp_path / "checkpoint.pkl", 50), StopAt(90)]))
+    assert len(episodes(tmp_path / "b")) < len(episodes(tmp_path / "a"))
+    continued, _ = load_checkpoint(tmp_path / "checkpoint.pkl")
+    continued.learn(STEPS - continued.num_timesteps, reset_num_timesteps=False)
+    assert episodes(tmp_path / "b") == episodes(tmp_path / "a")
+
+
+def test_a_checkpoint_of_environments_in_other_processes_is_refused_at_the_start(tmp_path: Path) -> None:
+    venv = make_vec_env("Pendulum-v1", 1, vec_env_cls=SubprocVecEnv)
+    model = BisimSAC("MlpPolicy", venv, **LEARNING)
+    with pytest.raises(ValueError, match="use DummyVecEnv"):
+        model.learn(10, callback=Checkpoint(tmp_path / "checkpoint.pkl", 5))
+    venv.close()
+
+
+def test_a_checkpoint_needs_steps_in_between() -> None:
+    with pytest.raises(ValueError, match="every=0"):
+        Checkpoint("checkpoint.pkl", 0)
+
+
+def test_the_command_line_refuses_the_checkpoint_of_another_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["sb3_robust_bisim"])
+    common = [
+        *("train", "--env", "robust_bisim/SparseCartPole-v0", "--n-timesteps", "60", "--eval-freq", "-1", "--verbose", "0"),
+        *("--log-folder", str(tmp_path), "--checkpoint", str(tmp_path / "checkpoint.pkl"), "--checkpoint-freq", "50"),
+    ]
+    monkeypatch.setattr(zoo.BisimExperimentManager, "save_trained_model", lambda *_: None)  # as if killed before
+    zoo.main([*common, "-params", "learning_starts:20", "batch_size:8"])
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(ValueError, match=r"batch_size is 8 there and 16 here\. Name another file"):
+        zoo.main([*common, "-params", "learning_starts:20", "batch_size:16"])
+    assert sorted(tmp_path.rglob("*")) == before

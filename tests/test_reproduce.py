@@ -1,0 +1,152 @@
+"""The sweep that repeats the paper's figures, with real processes that are really killed."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytestmark = pytest.mark.xdist_group("sweeps")  # they share the local one, and both cores
+
+ROOT = Path(__file__).parent.parent
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+
+
+def reproduce(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
+    return subprocess.run(command(folder, *arguments), env=ENVIRONMENT, capture_output=True, text=True, timeout=600)
+
+
+def command(folder: Path, *arguments: str) -> list[str]:
+    places = ["--out", str(folder / "results"), "--work", str(folder / "work")]
+    return [sys.executable, str(ROOT / "benchmarks/reproduce.py"), *arguments, *places]
+
+
+SWEEP = [
+    *("cartpole", "--panels", "N_m=2", "--methods", "SAC", "normed-IR-ID", "--seeds", "3", "--steps", "400"),
+    *("--eval-freq", "100", "--params", "learning_starts:100", "initial_gradient_steps:20", "batch_size:32"),
+]
+
+
+def results(folder: Path) -> dict[str, dict]:
+    return {path.stem: json.loads(path.read_text()) for path in (folder / "results" / "cartpole").glob("*.json")}
+
+
+@contextmanager
+def started(*arguments: str) -> Iterator[subprocess.Popen]:
+    process = subprocess.Popen([sys.executable, *arguments], env=ENVIRONMENT, stderr=subprocess.DEVNULL)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+@contextmanager
+def dask_cluster() -> Iterator[tuple[str, list[subprocess.Popen]]]:
+    """A scheduler and two workers, each a process of its own."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{probe.getsockname()[1]}"
+    host, port = address.split(":")
+    worker = ("-m", "dask", "worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard")
+    with (
+        started("-m", "dask", "scheduler", "--host", host, "--port", port, "--no-dashboard"),
+        started(*worker) as first,
+        started(*worker) as second,
+    ):
+        yield address, [first, second]
+
+
+def wait_until(condition: Callable[[], Any], process: subprocess.Popen, seconds: float = 300) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, "the sweep ended too early"
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six runs on this machine, undisturbed."""
+    folder = tmp_path_factory.mktemp("local")
+    process = reproduce(folder, *SWEEP, "--jobs", "2")
+    assert process.returncode == 0, process.stderr
+    assert json.loads(process.stdout.splitlines()[-1])["runs"] == 6
+    return folder
+
+
+def test_a_sweep_on_dask_survives_the_death_of_a_worker_and_gives_the_numbers_of_a_local_one(local, tmp_path) -> None:
+    with dask_cluster() as (address, workers):
+        arguments = command(tmp_path, *SWEEP, "--backend", "dask", "--scheduler", address)
+        with subprocess.Popen(arguments, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+            # both workers are in the middle of a run, with something to go on from
+            wait_until(lambda: len(list(tmp_path.glob("work/cartpole/*/checkpoint.pkl"))) == 2, process)
+            workers[0].send_signal(signal.SIGKILL)
+            assert process.wait(timeout=600) == 0
+    expected, found = results(local), results(tmp_path)
+    assert {name: run["evaluations"] for name, run in found.items()} == {
+        name: run["evaluations"] for name, run in expected.items()
+    }
+    assert len(found) == 6
+    logs = [path.read_text() for path in tmp_path.glob("work/cartpole/*/log.txt")]
+    assert sum("Going on from step" in log for log in logs) == 1
+    assert all(log.count("Saving to") == 1 for log in logs)
+
+
+def test_a_sweep_goes_on_from_where_it_was_killed_and_ends_with_the_same_numbers(local, tmp_path) -> None:
+    arguments = command(tmp_path, *SWEEP, "--jobs", "2")
+    with subprocess.Popen(arguments, env=ENVIRONMENT, stderr=subprocess.DEVNULL, start_new_session=True) as process:
+        wait_until(lambda: results(tmp_path) and list(tmp_path.glob("work/cartpole/*/checkpoint.pkl")), process)
+        os.killpg(process.pid, signal.SIGKILL)
+    ended = {path: path.stat().st_mtime_ns for path in tmp_path.glob("results/cartpole/*.json")}
+    assert 1 <= len(ended) < 6
+    assert reproduce(tmp_path, *SWEEP, "--jobs", "2").returncode == 0
+    assert {name: run["evaluations"] for name, run in results(tmp_path).items()} == {
+        name: run["evaluations"] for name, run in results(local).items()
+    }
+    assert {path: path.stat().st_mtime_ns for path in ended} == ended, "a finished run was run again"
+    assert any("Going on from step" in path.read_text() for path in tmp_path.glob("work/cartpole/*/log.txt"))
+
+
+def test_a_finished_sweep_has_curves_a_csv_and_a_table_and_nothing_left_to_do(local) -> None:
+    folder = local / "results" / "cartpole"
+    assert (folder / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert "mean_return,N_m=2,normed-IR-ID,3,400," in (folder / "curves.csv").read_text()
+    assert "| N_m=2 | normed-IR-ID | 3 |" in (folder / "table.md").read_text()
+    process = reproduce(local, *SWEEP, "--dry-run")
+    assert process.stdout == ""
+    assert process.stderr.startswith("6 of 6 runs have ended")
+
+
+def test_a_dry_run_shows_commands_that_the_command_line_accepts(tmp_path) -> None:
+    process = reproduce(tmp_path, *SWEEP, "--dry-run")
+    commands = process.stdout.splitlines()
+    assert len(commands) == 6
+    assert not (tmp_path / "work").exists()
+    assert "--variant SAC" in commands[0]
+    assert "0 of 6 runs have ended; the rest takes" in process.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("tetris",), "invalid choice: 'tetris'"),
+        (("cartpole", "--methods", "DQN"), "--methods DQN: cartpole has SAC, DBC"),
+        (("cartpole", "--panels", "N_m=9"), "--panels N_m=9: cartpole has N_m=0"),
+        (("cartpole", "--seeds", "0"), "--seeds 0: must be at least 1"),
+        (("cartpole", "--backend", "dask"), "--backend dask and --scheduler ADDRESS belong together"),
+    ],
+)
+def test_wrong_arguments_are_named_before_anything_runs(arguments, named, tmp_path) -> None:
+    process = reproduce(tmp_path, *arguments)
+    assert process.returncode == 2
+    assert named in process.stderr
+    assert not list(tmp_path.iterdir())

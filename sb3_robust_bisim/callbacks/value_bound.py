@@ -1,0 +1,97 @@
+"""Whether learned distances bound differences of value."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from sb3_robust_bisim.callbacks.diagnostic import EnvironmentCallback, embed, new_axes
+from sb3_robust_bisim.losses import pairwise_distance
+
+
+class ValueBoundCallback(EnvironmentCallback):
+    """
+    Do learned distances bound differences of value, as thm:generalized-ct says that the exact metric does?
+
+    Runs episodes of the present policy, takes the discounted return of what is left of the episode as the value of a state
+    (after a time-out the critic's value of the last state stands for the rest), and compares the gap of every pair of states
+    with their distance d / c_R + 2 (R_max - R_min) (gamma - c_T) / ((1 - gamma) (1 - c_T)), the second term for c_T < gamma
+    only. Records ``bisim/value_bound_violations``, the fraction of pairs whose gap is larger; the means
+    ``bisim/value_gap`` and ``bisim/value_bound``; and the scatter ``bisim/value_gap_against_bound``.
+
+    The theorem is about expected returns; a single return of a random task scatters around its own. The distance is what the
+    metric loss trains; ``huber`` is averaged over coordinates and no metric, so it may break the bound at any time.
+
+    The arguments are those of :class:`EnvironmentCallback`; whole episodes are run until there are ``n_states`` states.
+    Another environment should pay the reward that the agent was trained on.
+
+    :raises ValueError: also at the start of training, for ``c_r=0`` or ``gamma=1``, for which there is no bound
+    :raises ImportError: without the extra ``theory``
+
+    Example::
+
+        model = BisimSAC("MlpPolicy", "robust_bisim/SparseCartPole-v0", distance="l1")
+        model.learn(10_000, callback=ValueBoundCallback(every=2000))
+    """
+
+    def _prepare(self) -> None:
+        try:
+            from sb3_robust_bisim.bounds import value_difference_bound
+        except ImportError as error:
+            raise ImportError('ValueBoundCallback needs pip install "sb3_robust_bisim[theory]".') from error
+        self._bound = value_difference_bound
+        if self.model.c_r == 0 or self.model.gamma == 1:
+            raise ValueError(f"c_r={self.model.c_r}, gamma={self.model.gamma}: a bound on values needs c_r > 0 and gamma < 1.")
+        super()._prepare()
+
+    def _measure(self) -> None:
+        obs, returns = self._returns()
+        keep = np.linspace(0, len(obs) - 1, self.n_states).astype(int)  # of all the episodes, the last one too
+        z, _ = embed(self.model, self._tensor([obs[i] for i in keep]))
+        first, second = np.triu_indices(len(keep), 1)
+        distance = pairwise_distance(z[first], z[second], self.model.distance).mean(dim=1).double().cpu().numpy()
+        gap = np.abs(returns[keep][first] - returns[keep][second])
+        r_min, r_max = self.model.reward_range
+        bound = self._bound(distance, self.model.c_r, self.model._c_t, self.model.gamma, r_max - r_min)
+        self.logger.record("bisim/value_bound_violations", float((gap > bound).mean()))
+        self.logger.record("bisim/value_gap", float(gap.mean()))
+        self.logger.record("bisim/value_bound", float(bound.mean()))
+        self._record_figure("bisim/value_gap_against_bound", _bound_figure(bound, gap))
+
+    def _returns(self) -> tuple[list[Any], np.ndarray]:
+        """Observations of whole episodes and the discounted returns that followed them."""
+        observations: list[Any] = []
+        returns: list[float] = []
+        rewards: list[float] = []
+        for step in self._walk():
+            observations.append(step.obs)
+            rewards.append(step.reward)
+            if step.done:
+                value = self._value(step.info["terminal_observation"]) if step.info["TimeLimit.truncated"] else 0.0
+                episode = []
+                for reward in reversed(rewards):
+                    value = reward + self.model.gamma * value
+                    episode.append(value)
+                returns += reversed(episode)
+                rewards = []
+                if len(returns) >= self.n_states:
+                    break
+        return observations, np.array(returns)
+
+    def _value(self, obs: Any) -> float:
+        row = {key: value[None] for key, value in obs.items()} if isinstance(obs, dict) else obs[None]
+        return embed(self.model, self._tensor([row]))[1].item()
+
+
+def _bound_figure(bound: np.ndarray, gap: np.ndarray) -> Figure:
+    """
+    :param bound: one entry per pair of states, likewise ``gap``
+    """
+    figure, axes = new_axes()
+    shown = np.linspace(0, len(gap) - 1, min(len(gap), 5000)).astype(int)
+    axes.scatter(bound[shown], gap[shown], s=4, alpha=0.3)
+    largest = float(max(bound.max(), gap.max()))
+    axes.plot([0, largest], [0, largest], color="black", linewidth=1, label="bound (above: broken)")
+    axes.set(xlabel="bound from the learned distance", ylabel="observed gap of values")
+    axes.legend()
+    return figure

@@ -118,7 +118,7 @@ def _fill(obj: Any, state: dict[str, Any]) -> None:
 
 
 def _bare(cls: type, state: dict[str, Any]) -> Any:
-    obj = object.__new__(cls)
+    obj: Any = object.__new__(cls)
     _fill(obj, state)
     return obj
 

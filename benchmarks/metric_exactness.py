@@ -192,12 +192,10 @@ def train(arm: Arm, seed: int, steps: int, path: Path) -> dict:
         next_states = (cumulative[states, actions] < rng.random((BATCH_SIZE, 1))).sum(axis=1).clip(max=N_STATES - 1)
         rewards = th.as_tensor(mdp.reward[states, actions][:, None], dtype=th.float32)
         z, next_z = model.critic.encode(observe(states)), model.critic.encode(observe(next_states))
-        terms: dict[str, th.Tensor] = {}
-        weights: dict[str, float] = {}
-        model._representation_losses(z, next_z, th.as_tensor(ACTIONS[actions]), rewards, terms, weights)
+        loss, terms = model._representation_losses(z, next_z, th.as_tensor(ACTIONS[actions]), rewards)
         for optimizer in optimizers:
             optimizer.zero_grad()
-        th.stack([weight * terms[name] for name, weight in weights.items()]).sum().backward()
+        loss.backward()
         for optimizer in optimizers:
             optimizer.step()
         schedule.step()

@@ -29,6 +29,7 @@ from _machine import machine
 from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecFrameStack
 from torch.nn import functional as F
 from tqdm import tqdm
 
@@ -40,6 +41,7 @@ SCHEDULE = {"paper": dict(policy_delay=2, target_update_interval=2), "sac": dict
 FULL = dict(intrinsic_reward_scale=2.0, inverse_dynamics_coef=1.0)
 OFF = dict(bisim_coef=0.0, norm_constraint=False)
 CARTPOLE = "robust_bisim/SparseCartPole-v0"
+PIXELS = "robust_bisim/cheetah-run-pixels-v0"
 
 
 class RandomPixels(gym.Env):
@@ -199,20 +201,33 @@ def update_times(kind: str, rounds: int, per_round: int) -> dict[str, dict]:
     return result
 
 
-def bonus_cost(env_id: str, n_envs: int, steps: int) -> dict[str, float]:
-    """Time of environment step plus policy call, with the bonus bound over unbound, interleaved."""
-    venv = IntrinsicRewardVecEnv(make_vec_env(env_id, n_envs, env_kwargs=dict(noise_multiplier=2), seed=0))
-    model = BisimSAC("MlpPolicy", venv, seed=0, buffer_size=1000, **FULL)
-    obs, times = venv.reset(), {True: [], False: []}
-    for step in range(2 * steps):
-        bound = step % 2 == 0
-        venv.bind(model._intrinsic_reward if bound else None)
-        started = time.perf_counter()
-        actions, _ = model.predict(obs)  # type: ignore[arg-type]
-        obs, *_ = venv.step(actions)
-        times[bound].append(1000 * (time.perf_counter() - started))
-    with_bonus, without = (float(np.median(times[bound])) for bound in (True, False))
-    return {"n_envs": n_envs, "with_ms": with_bonus, "without_ms": without, "ratio": with_bonus / without}
+def bonus_cost(env_id: str, n_envs: int, steps: int, bf16: bool = False) -> dict[str, float]:
+    """
+    Milliseconds of policy call plus environment step as in `learn()`, interleaved: with the bonus (`with_ms`), with it after
+    an update, so that nothing embedded before is of use (`after_update_ms`), and as SB3's SAC acts, with nothing bound.
+    """
+    pixels = "pixels" in env_id
+    env_kwargs = dict(distractor="none", shadows=False) if pixels else dict(noise_multiplier=2)
+    venv = make_vec_env(env_id, n_envs, env_kwargs=env_kwargs, seed=0)
+    bonus_env = IntrinsicRewardVecEnv(VecFrameStack(venv, 3) if pixels else venv)
+    model = BisimSAC("CnnPolicy" if pixels else "MlpPolicy", bonus_env, seed=0, buffer_size=n_envs, bf16=bf16, **FULL)
+    model.learn(n_envs)
+    model.policy.set_training_mode(False)  # as collect_rollouts does, once before its steps
+    times: dict[str, list[float]] = {"without_ms": [], "with_ms": [], "after_update_ms": []}
+    for round_number, name in itertools.product(range(steps + 1), times):
+        bonus_env.bind(None if name == "without_ms" else model._intrinsic_reward)
+        sample_action = SAC._sample_action if name == "without_ms" else BisimSAC._sample_action
+        for _ in range(2):  # the first one finds what another arm has left
+            model._n_updates += name == "after_update_ms"
+            started = time.perf_counter()
+            actions, _ = sample_action(model, 0, None, n_envs)
+            model._last_obs, *_ = model.env.step(actions)  # type: ignore[union-attr]
+            seconds = time.perf_counter() - started
+        if round_number > 0:
+            times[name].append(1000 * seconds)
+    medians = {name: float(np.median(values)) for name, values in times.items()}
+    ratios = {name: float(np.median(np.divide(times[f"{name}_ms"], times["without_ms"]))) for name in ("with", "after_update")}
+    return {"n_envs": n_envs, **medians, "ratio": ratios["with"], "ratio_after_update": ratios["after_update"]}
 
 
 def learn_cost(steps: int) -> dict[str, float]:
@@ -246,6 +261,8 @@ def main() -> None:
     if args.cnn_rounds:
         result["cnn"] = update_times("cnn", args.cnn_rounds, per_round=2)
     result["bonus"] = {env_id: bonus_cost(env_id, 16, 300) for env_id in (CARTPOLE, "robust_bisim/cheetah-run-v0")}
+    for precision in ("fp32", "bf16"):
+        result["bonus"][f"{PIXELS} {precision}"] = bonus_cost(PIXELS, 16, 30, bf16=precision == "bf16")
     result["learn"] = learn_cost(500)
     print(json.dumps(result))
 

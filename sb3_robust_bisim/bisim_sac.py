@@ -7,6 +7,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import check_for_correct_spaces, polyak_update
@@ -123,6 +124,8 @@ class BisimSAC(SAC):
         self.policy_delay = policy_delay
         self.initial_gradient_steps = initial_gradient_steps
         self.bf16 = bf16
+        # The last observation that was embedded while collecting, its embedding, and `_n_updates` at that time
+        self._embedded: tuple[Any, th.Tensor, int] | None = None
 
         if _init_setup_model:
             self._setup_model()
@@ -177,23 +180,24 @@ class BisimSAC(SAC):
             self._n_updates += 1
             # Sample replay buffer
             replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
-            obs, next_obs = replay_data.observations, replay_data.next_observations
+            obs = self.critic.preprocess(replay_data.observations)
+            next_obs = self.critic.preprocess(replay_data.next_observations)
 
             # We need to sample because `log_std` may have changed between two gradient steps
             if self.use_sde:
                 self.actor.reset_noise()
 
             # The only place where the batch is encoded, but for the target encoder
-            z = self.critic.encode(obs)
+            z = self.critic.embed(obs)
             with th.set_grad_enabled(self.inverse_dynamics_coef > 0):
-                next_z = self.critic.encode(next_obs)
+                next_z = self.critic.embed(next_obs)
 
             ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
             with th.no_grad():
                 # Select action according to policy
                 next_actions, next_log_prob = self.actor.features_log_prob(self.actor.features(next_obs, next_z))
                 # Compute the next Q values: min over all critics targets
-                next_q_values = self.critic_target.q_values(self.critic_target.encode(next_obs), next_actions)
+                next_q_values = self.critic_target.q_values(self.critic_target.embed(next_obs), next_actions)
                 next_q_value = th.cat(next_q_values, dim=1).min(dim=1, keepdim=True).values
                 # add entropy term
                 next_q_value = next_q_value - ent_coef * next_log_prob.reshape(-1, 1)
@@ -202,14 +206,14 @@ class BisimSAC(SAC):
 
             # Compute critic loss. No factor 0.5: it is one summand of the encoder's loss, weighted as published
             current_q_values = self.critic.q_values(z, replay_data.actions)
-            step = {"train/critic_loss": th.stack([F.mse_loss(q, target_q_value) for q in current_q_values]).sum()}
-            weights = {"train/critic_loss": 1.0}
-            self._representation_losses(z, next_z, replay_data.actions, replay_data.rewards, step, weights)
+            critic_loss = th.stack([F.mse_loss(q, target_q_value) for q in current_q_values]).sum()
+            representation_loss, values = self._representation_losses(z, next_z, replay_data.actions, replay_data.rewards)
+            step = {"train/critic_loss": critic_loss, **values}
 
             # Optimize encoder, critic and models, in one backward pass
             self.critic.optimizer.zero_grad()
             inverse_dynamics.optimizer.zero_grad()
-            th.stack([weight * step[name] for name, weight in weights.items()]).sum().backward()
+            (critic_loss + representation_loss).backward()
             self.critic.optimizer.step()
             inverse_dynamics.optimizer.step()
 
@@ -251,40 +255,37 @@ class BisimSAC(SAC):
             self._record({**scalars, **{name: [(self._n_updates, value)] for name, value in statistics.items()}})
 
     def _representation_losses(
-        self,
-        z: th.Tensor,
-        next_z: th.Tensor,
-        actions: th.Tensor,
-        rewards: th.Tensor,
-        step: dict[str, th.Tensor],
-        weights: dict[str, float],
-    ) -> None:
+        self, z: th.Tensor, next_z: th.Tensor, actions: th.Tensor, rewards: th.Tensor
+    ) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """
-        Add to ``step`` what shapes the encoder beside the critic, and to ``weights`` how much of it.
+        What shapes the encoder beside the critic.
 
         :param z: (B, n) embeddings, with gradient
         :param next_z: (B, n) embeddings of the successors; only the inverse-dynamics loss sends gradient through them
         :param actions: (B, n_a) in [-1, 1]
         :param rewards: (B, 1)
+        :return: the weighted sum of the losses, and by TensorBoard key each loss without its weight, and the metric's means
         """
+        total, values = z.new_zeros(()), {}
         if self.bisim_coef > 0 or self._model_coef > 0:
             prediction = self.policy.dynamics(z, actions)
         if self._model_coef > 0:
             predicted_rewards = self.policy.reward_model(self.policy.dynamics.sample(prediction))
-            step["train/dynamics_loss"] = losses.dynamics_loss(prediction.mean, prediction.std, next_z)
-            step["train/reward_loss"] = F.mse_loss(predicted_rewards, rewards)
-            weights["train/dynamics_loss"] = weights["train/reward_loss"] = self._model_coef
+            values["train/dynamics_loss"] = losses.dynamics_loss(prediction.mean, prediction.std, next_z)
+            values["train/reward_loss"] = F.mse_loss(predicted_rewards, rewards)
+            total = total + self._model_coef * (values["train/dynamics_loss"] + values["train/reward_loss"])
         if self.bisim_coef > 0:
             mean, std = prediction.moments()
             pairs = th.randperm(len(z), device=z.device)
-            step["train/bisim_loss"], step["bisim/mu_bd"], step["bisim/mu_rd"] = losses.bisim_loss(
+            values["train/bisim_loss"], values["bisim/mu_bd"], values["bisim/mu_rd"] = losses.bisim_loss(
                 z, rewards, mean, std, pairs, self.c_r, self._c_t, self.distance
             )
-            weights["train/bisim_loss"] = self.bisim_coef
+            total = total + self.bisim_coef * values["train/bisim_loss"]
         if self.inverse_dynamics_coef > 0:
             predicted_actions = self.policy.inverse_dynamics(z, next_z)
-            step["train/inverse_dynamics_loss"] = losses.inverse_dynamics_loss(predicted_actions, actions)
-            weights["train/inverse_dynamics_loss"] = self.inverse_dynamics_coef
+            values["train/inverse_dynamics_loss"] = losses.inverse_dynamics_loss(predicted_actions, actions)
+            total = total + self.inverse_dynamics_coef * values["train/inverse_dynamics_loss"]
+        return total, values
 
     def _record(self, scalars: dict[str, list[tuple[int, th.Tensor]]]) -> None:
         """
@@ -323,13 +324,41 @@ class BisimSAC(SAC):
         :param next_obs: true successors
         :return: (n_envs,)
         """
-        both = _concatenate(obs, next_obs)  # one pass of the encoder
         if self._vec_normalize_env is not None:
-            both = self._vec_normalize_env.normalize_obs(both)
-        z, next_z = self.critic.encode(self.policy.obs_to_tensor(both)[0]).chunk(2)
+            obs, next_obs = self._vec_normalize_env.normalize_obs(obs), self._vec_normalize_env.normalize_obs(next_obs)
+        z, next_z = self._embed(obs), self._embed(next_obs, known=False)
         scaled_actions = th.as_tensor(self.policy.scale_action(actions), dtype=th.float32, device=self.device).flatten(1)
         mean, _ = self.policy.dynamics(z, scaled_actions).moments()
         return losses.intrinsic_reward(mean, next_z, self.intrinsic_reward_scale, self.intrinsic_reward_max).cpu().numpy()
+
+    def _embed(self, obs: Any, known: bool = True) -> th.Tensor:
+        """
+        Embed what is observed while collecting: once under the same weights, though policy and bonus both ask for it.
+
+        :param obs: n_envs rows, as the policy sees them
+        :param known: whether ``obs`` may have been embedded before
+        :return: (n_envs, n)
+        """
+        if known and self._embedded is not None:
+            embedded, z, n_updates = self._embedded
+            if n_updates == self._n_updates and _is_same(obs, embedded):
+                return z
+        z = self.critic.encode(self.policy.obs_to_tensor(obs)[0])
+        self._embedded = obs, z, self._n_updates
+        return z
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        warmup = self.num_timesteps < learning_starts
+        if warmup or self.intrinsic_reward_scale == 0 or action_noise is not None or not self.policy.share_features_extractor:
+            return super()._sample_action(learning_starts, action_noise, n_envs)
+        # The same action, bit by bit, on an embedding that the bonus has computed already or can use afterwards
+        with th.no_grad():
+            squashed = self.actor.sample(self._embed(self._last_obs)).cpu().numpy()
+        squashed = squashed.reshape(n_envs, *self.action_space.shape)  # type: ignore[misc]
+        buffer_action = self.policy.scale_action(self.policy.unscale_action(squashed))
+        return self.policy.unscale_action(buffer_action), buffer_action
 
     def _bind_intrinsic_reward(self, env: VecEnv) -> VecEnv:
         """Bind the bonus to the wrapper in the chain; without a bonus, unbind it, for another model may have been there."""
@@ -380,6 +409,7 @@ class BisimSAC(SAC):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfBisimSAC:
+        self._embedded = None  # weights or environment may have been replaced since
         return super().learn(
             total_timesteps=total_timesteps,
             callback=callback,
@@ -408,16 +438,20 @@ class BisimSAC(SAC):
         with atomic_path(path if pathlib.Path(path).suffix else f"{path}.pkl") as temporary:
             super().save_replay_buffer(temporary)
 
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_embedded"]
+
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()
         return [*state_dicts, "policy.inverse_dynamics.optimizer"], tensors
 
 
-def _concatenate(obs: Any, next_obs: Any) -> Any:
-    """Observations of either kind, one batch below the other."""
-    if isinstance(obs, dict):
-        return {key: np.concatenate([obs[key], next_obs[key]]) for key in obs}
-    return np.concatenate([obs, next_obs])
+def _is_same(obs: Any, other: Any) -> bool:
+    """Whether both are one observation: one object, or one the transposed view of the other, as VecTransposeImage makes it."""
+    if obs is other:
+        return True
+    views = isinstance(obs, np.ndarray) and isinstance(other, np.ndarray) and (obs.base is other or other.base is obs)
+    return views and obs.size == other.size
 
 
 def _embedding_statistics(z: th.Tensor, radius: float | None) -> dict[str, th.Tensor]:

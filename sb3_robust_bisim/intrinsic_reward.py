@@ -56,8 +56,8 @@ class IntrinsicRewardVecEnv(VecEnvWrapper):
         if self._bonus is not None and self._last_obs is not None:
             bonus = self._bonus(self._last_obs, self._actions, _successors(obs, dones, infos))
             rewards = rewards + bonus
-            for info, value in zip(infos, bonus, strict=True):
-                info["intrinsic_reward"] = float(value)
+            for info, value in zip(infos, bonus.tolist(), strict=True):
+                info["intrinsic_reward"] = value
         self._last_obs = obs
         return obs, rewards, dones, infos
 

@@ -1,12 +1,13 @@
 """SAC's policies with one encoder: the critic owns and trains it, the actor reads its detached output."""
 
+from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import BaseModel, ContinuousCritic
-from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim, preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
@@ -26,13 +27,19 @@ def _fused(adam_kwargs: dict[str, Any]) -> dict[str, Any]:
     return adam_kwargs if "foreach" in adam_kwargs else {"fused": True, **adam_kwargs}
 
 
-def _inside_ball(
-    model: BaseModel, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor, radius: float | None, bf16: bool
-) -> th.Tensor:
-    """The encoder's output for ``obs`` in fp32 and inside the ball; the encoder itself runs under autocast if asked to."""
-    with th.autocast(model.device.type, th.bfloat16, enabled=bf16):
-        features = BaseModel.extract_features(model, obs, features_extractor)
-    return project_to_ball(features.float(), radius)
+def _preprocess(model: "BisimActor | BisimCritic", obs: PyTorchObs) -> PyTorchObs:
+    """SB3's ``preprocess_obs``; under bf16, images for our own encoder come at once as autocast would round them."""
+    if model.bf16 and model.normalize_images and type(model.features_extractor) is PixelEncoder:
+        assert isinstance(obs, th.Tensor)
+        return obs.to(th.bfloat16, copy=True).div_(255)  # 0..255 are exact in bf16
+    return preprocess_obs(obs, model.observation_space, model.normalize_images)
+
+
+def _embed(model: "BisimActor | BisimCritic", preprocessed_obs: PyTorchObs) -> th.Tensor:
+    """The encoder's output in fp32 and inside the ball; the encoder itself runs under autocast if asked to."""
+    with th.autocast(model.device.type, th.bfloat16) if model.bf16 else nullcontext():
+        features = model.features_extractor(preprocessed_obs)
+    return project_to_ball(features.float(), model.radius)
 
 
 class BisimActor(Actor):
@@ -57,17 +64,19 @@ class BisimActor(Actor):
         return {**super()._get_constructor_parameters(), **own}
 
     def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
+        """For SB3, which hands over the model's own extractor."""
         with th.set_grad_enabled(th.is_grad_enabled() and not self.detach_features):
-            return _inside_ball(self, obs, features_extractor, self.radius, self.bf16)
+            return _embed(self, _preprocess(self, obs))
 
-    def features(self, obs: PyTorchObs, z: th.Tensor) -> th.Tensor:
+    def features(self, preprocessed_obs: PyTorchObs, z: th.Tensor) -> th.Tensor:
         """
-        What the heads read for ``obs``: the critic's embedding of it, detached, so that nothing is encoded twice; or,
-        with ``share_features_extractor=False``, the output of the actor's own encoder.
+        What the heads read: the critic's embedding, detached, so that nothing is encoded twice; or, with
+        ``share_features_extractor=False``, the output of the actor's own encoder.
 
-        :param z: (B, n), the critic's embedding of ``obs``
+        :param preprocessed_obs: output of the critic's ``preprocess``
+        :param z: (B, n), the critic's embedding of them
         """
-        return z.detach() if self.detach_features else self.extract_features(obs, self.features_extractor)
+        return z.detach() if self.detach_features else _embed(self, preprocessed_obs)
 
     def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
         return self._dist_params(self.extract_features(obs, self.features_extractor))
@@ -79,6 +88,11 @@ class BisimActor(Actor):
             return mean_actions, self.log_std, dict(latent_sde=latent_pi)
         log_std = th.tanh(self.log_std(latent_pi))  # type: ignore[operator]
         return mean_actions, LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (log_std + 1), {}
+
+    def sample(self, features: th.Tensor) -> th.Tensor:
+        """Draw actions in [-1, 1] for features in place of observations: (B, n) -> (B, n_a)"""
+        mean_actions, log_std, kwargs = self._dist_params(features)
+        return self.action_dist.actions_from_params(mean_actions, log_std, **kwargs)  # type: ignore[arg-type]
 
     def features_log_prob(self, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Like ``action_log_prob``, for features in place of observations: (B, n) -> (B, n_a), (B,)"""
@@ -100,11 +114,20 @@ class BisimCritic(ContinuousCritic):
         self.bf16 = bf16
 
     def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
-        return _inside_ball(self, obs, features_extractor, self.radius, self.bf16)
+        """For SB3, which hands over the model's own extractor."""
+        return self.encode(obs)
+
+    def preprocess(self, obs: PyTorchObs) -> PyTorchObs:
+        """What the encoder reads of observations: floats, images in [0, 1]."""
+        return _preprocess(self, obs)
+
+    def embed(self, preprocessed_obs: PyTorchObs) -> th.Tensor:
+        """z = phi(s) inside the ball, (B, n), for the output of :meth:`preprocess`."""
+        return _embed(self, preprocessed_obs)
 
     def encode(self, obs: PyTorchObs) -> th.Tensor:
-        """z = phi(s) inside the ball, (B, n)."""
-        return self.extract_features(obs, self.features_extractor)
+        """z = phi(s) inside the ball, (B, n), for observations."""
+        return self.embed(self.preprocess(obs))
 
     def q_values(self, z: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         """One (B, 1) tensor per critic; z (B, n), actions (B, n_a) in [-1, 1]."""

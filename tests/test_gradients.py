@@ -41,8 +41,7 @@ def with_gradient(model: BisimSAC) -> set[str]:
 def representation_losses(model: BisimSAC) -> dict[str, th.Tensor]:
     batch = model.replay_buffer.sample(16)
     z, next_z = model.critic.encode(batch.observations), model.critic.encode(batch.next_observations)
-    step: dict[str, th.Tensor] = {}
-    model._representation_losses(z, next_z, batch.actions, batch.rewards, step, {})
+    _, step = model._representation_losses(z, next_z, batch.actions, batch.rewards)
     model.policy.zero_grad()
     return step
 
@@ -67,8 +66,7 @@ def test_the_inverse_loss_reaches_the_encoder_through_both_observations() -> Non
     model = trained()
     batch = model.replay_buffer.sample(16)
     z, next_z = (model.critic.encode(obs).detach().requires_grad_() for obs in (batch.observations, batch.next_observations))
-    step: dict[str, th.Tensor] = {}
-    model._representation_losses(z, next_z, batch.actions, batch.rewards, step, {})
+    _, step = model._representation_losses(z, next_z, batch.actions, batch.rewards)
     step["train/inverse_dynamics_loss"].backward()
     assert z.grad.abs().sum() > 0
     assert next_z.grad.abs().sum() > 0

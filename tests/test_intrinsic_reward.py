@@ -1,5 +1,8 @@
 """The bonus wrapper: real transitions, terminal ones included, under every wrapper that it may meet."""
 
+import json
+import zipfile
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -7,10 +10,21 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack, VecNormalize, is_vecenv_wrapped
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecEnv,
+    VecEnvWrapper,
+    VecFrameStack,
+    VecNormalize,
+    is_vecenv_wrapped,
+)
 
 from sb3_robust_bisim import BisimSAC, IntrinsicRewardVecEnv
 
@@ -140,8 +154,9 @@ def test_under_vecnormalize_it_reads_normalised_observations_and_reaches_the_buf
     np.testing.assert_allclose(model.replay_buffer.rewards[:9], 5.5)
     obs = np.array([[2.0, 1.0]], dtype=np.float32)
     model._intrinsic_reward(obs, np.zeros((1, 1)), obs)
-    np.testing.assert_array_equal(encoded[-1], venv.normalize_obs(np.concatenate([obs, obs])))
-    assert not np.allclose(encoded[-1][:1], obs)
+    for seen in encoded[-2:]:
+        np.testing.assert_array_equal(seen, venv.normalize_obs(obs))
+        assert not np.allclose(seen, obs)
 
 
 def test_frame_stacks_below_it_are_seen_whole() -> None:
@@ -154,6 +169,115 @@ def test_frame_stacks_below_it_are_seen_whole() -> None:
     inside = VecFrameStack(IntrinsicRewardVecEnv(DummyVecEnv([make_env])), 3)
     with pytest.raises(ValueError, match="VecFrameStack"):
         BisimSAC("CnnPolicy", inside, intrinsic_reward_scale=1.0, buffer_size=50, **SMALL)
+
+
+class PlainPolicyCall(BisimSAC):
+    """Acts as SB3's SAC does: encodes the observation anew for each action."""
+
+    _sample_action = SAC._sample_action
+
+
+class OneArray(VecEnvWrapper):
+    """Writes every observation into the same array."""
+
+    def reset(self) -> np.ndarray:
+        self.array = self.venv.reset()
+        return self.array
+
+    def step_wait(self) -> Any:
+        self.array[:], *rest = self.venv.step_wait()
+        return self.array, *rest
+
+
+def small_images() -> gym.Env:
+    """Channel-last, so that SB3 puts a VecTransposeImage around the wrapper."""
+    image = FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False)
+    image.observation_space.seed(0)
+    return gym.wrappers.TimeLimit(image, 7)
+
+
+COLLECTION: dict[str, tuple[str, Callable[[], VecEnv], dict[str, Any]]] = {
+    "flat": ("MlpPolicy", lambda: DummyVecEnv([Countdown] * 2), {}),
+    "no update between two steps": ("MlpPolicy", lambda: DummyVecEnv([Countdown] * 2), {"train_freq": 4}),
+    "gSDE": ("MlpPolicy", lambda: DummyVecEnv([Countdown] * 2), {"use_sde": True, "use_sde_at_warmup": True}),
+    "action noise": (
+        "MlpPolicy",
+        lambda: DummyVecEnv([Countdown]),
+        {"action_noise": NormalActionNoise(np.zeros(1), np.ones(1))},
+    ),
+    "own encoder": (
+        "MlpPolicy",
+        lambda: DummyVecEnv([Countdown] * 2),
+        {"policy_kwargs": {"net_arch": [16], "share_features_extractor": False}},
+    ),
+    "Dict": ("MultiInputPolicy", lambda: DummyVecEnv([lambda: Countdown(as_dict=True)] * 2), {}),
+    "VecNormalize": (
+        "MlpPolicy",
+        lambda: VecNormalize(IntrinsicRewardVecEnv(DummyVecEnv([Countdown] * 2)), norm_reward=False),
+        {"train_freq": 4},
+    ),
+    "one array": ("MlpPolicy", lambda: OneArray(DummyVecEnv([Countdown] * 2)), {"learning_starts": 0, "gradient_steps": 0}),
+    # at a reset it returns the array of the observation before
+    "VecFrameStack": (
+        "MlpPolicy",
+        lambda: VecFrameStack(DummyVecEnv([lambda: gym.make(ENV)]), 3),
+        {"learning_starts": 0, "gradient_steps": 0},
+    ),
+    "images": (
+        "CnnPolicy",
+        lambda: IntrinsicRewardVecEnv(DummyVecEnv([small_images] * 2)),
+        {"train_freq": 4, "buffer_size": 100},
+    ),
+}
+
+
+@pytest.mark.parametrize("case", COLLECTION)
+def test_actions_and_bonuses_are_bit_by_bit_those_of_sacs_own_policy_call(case: str) -> None:
+    policy, make_env, kwargs = COLLECTION[case]
+    stored = []
+    for algorithm in (BisimSAC, PlainPolicyCall):
+        model = algorithm(policy, make_env(), intrinsic_reward_scale=1.0, **{**SMALL, **kwargs})
+        for _ in range(2):
+            model.learn(30)
+        buffer = model.replay_buffer
+        stored.append((buffer.actions[: buffer.pos], buffer.rewards[: buffer.pos]))
+    for shared, plain in zip(*stored, strict=True):
+        np.testing.assert_array_equal(shared, plain)
+
+
+@pytest.mark.parametrize(("updates", "passes"), [(0, [1, 1, 2] * 2), (1, [2, 2, 2] * 2)])
+@pytest.mark.parametrize("images", [False, True])
+def test_policy_and_bonus_together_encode_each_observation_once(updates: int, passes: list[int], images: bool) -> None:
+    env = DummyVecEnv([(lambda: gym.wrappers.TimeLimit(small_images(), 3)) if images else Countdown])
+    kwargs = {**SMALL, "learning_starts": 3, "buffer_size": 50, "gradient_steps": updates, "intrinsic_reward_scale": 1.0}
+    model = BisimSAC("CnnPolicy" if images else "MlpPolicy", IntrinsicRewardVecEnv(env), **kwargs).learn(3)
+    counts, encoded = [], []
+    model.critic.features_extractor.register_forward_hook(lambda *_: encoded.append(1))
+    train = model.train
+
+    def uncounted(*args: Any, **kwargs: Any) -> None:
+        before = len(encoded)
+        train(*args, **kwargs)
+        del encoded[before:]
+
+    model.train = uncounted
+
+    class Count(BaseCallback):
+        def _on_step(self) -> bool:
+            counts.append(len(encoded))
+            encoded.clear()
+            return True
+
+    model.learn(7, callback=Count(), reset_num_timesteps=False)
+    assert counts[1:] == passes  # the first step of learn() knows no embedding
+
+
+def test_what_the_bonus_keeps_is_not_saved(tmp_path: Any) -> None:
+    model = BisimSAC("MlpPolicy", ENV, intrinsic_reward_scale=1.0, **SMALL).learn(12)
+    model.save(tmp_path / "m")
+    with zipfile.ZipFile(tmp_path / "m.zip") as archive:
+        assert "_embedded" not in json.loads(archive.read("data"))
+    assert BisimSAC.load(tmp_path / "m").predict(np.zeros(3, np.float32))[0].shape == (1,)
 
 
 def test_it_works_with_environments_in_other_processes() -> None:

@@ -123,18 +123,16 @@ def tables(results: list[Result], figure: Figure, out: Path) -> dict[str, Any]:
     for panel in figure.panels:
         ends = {m: series(runs, "return")[1][:, -1] for m in figure.methods if (runs := of(results, panel=panel, method=m))}
         panels[panel] = {m: _ending(of(results, panel=panel, method=m), final, ends.get(FULL)) for m, final in ends.items()}
-    lines = [
-        "| task | method | runs | last return ± s.e. | IQM [95 %] | P(full is better) [95 %] | largest norm | minutes |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    splits = [f"on {split} clips" for split in figure.splits]
+    heads = ["task", "method", "runs", "last return ± s.e.", "IQM [95 %]", "P(full is better) [95 %]", *splits, "largest norm"]
+    lines = [" | ".join(["", *heads, "minutes", ""]).strip(), "|---" * (len(heads) + 1) + "|"]
     for panel, methods in panels.items():
         for method, row in methods.items():
-            better = "" if method == FULL or "full_is_better" not in row else "{} [{}, {}]".format(*row["full_is_better"])
-            iqm, low, high = row["iqm"]
-            lines.append(
-                f"| {panel} | {method} | {row['runs']} | {row['mean']} ± {row['standard_error']} | {iqm} [{low}, {high}] "
-                f"| {better} | {row['largest_norm']} | {row['minutes']} |"
-            )
+            error = "" if row["standard_error"] is None else f" ± {row['standard_error']}"
+            better = "{} [{}, {}]".format(*row["full_is_better"]) if method != FULL and "full_is_better" in row else ""
+            played = [", ".join(map(str, row.get(f"final_return_{split}", []))) for split in figure.splits]
+            cells = [panel, method, row["runs"], f"{row['mean']}{error}", "{} [{}, {}]".format(*row["iqm"]), better, *played]
+            lines.append(" | ".join(["", *map(str, cells), str(row["largest_norm"]), str(row["minutes"]), ""]).strip())
     measured = sorted({f"commit {r['commit']}, {r['machine']}, torch {r['versions']['torch']}" for r in results})
     seeds = sorted({r["seed"] for r in results})
     lines += ["", f"Seeds {seeds[0]} to {seeds[-1]}; {'; '.join(measured)}.", ""]
@@ -168,5 +166,7 @@ def _ending(runs: list[Result], final: np.ndarray, full: np.ndarray | None) -> d
     return row
 
 
-def _short(value: float) -> float:
+def _short(value: float) -> float | None:
+    if not np.isfinite(value):
+        return None
     return float(f"{value:.3g}") if abs(value) < 1000 else round(float(value))

@@ -8,19 +8,16 @@ Time: both buffers in one process, full, used in turn. The last line printed is 
 import argparse
 import json
 import multiprocessing
-import platform
 import statistics
-import subprocess
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import psutil
-import stable_baselines3
 import torch as th
+from _machine import machine
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
@@ -132,31 +129,8 @@ def measure(n_envs: int, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def describe_run(args: argparse.Namespace) -> dict[str, Any]:
-    commit = subprocess.run(
-        ["git", "rev-parse", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True, check=False
-    )
-    cpuinfo = Path("/proc/cpuinfo")
-    models = [line.split(":")[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
-    return {
-        "benchmark": "replay_memory",
-        "settings": vars(args),
-        "seeds": [args.seed],
-        "commit": commit.stdout.strip() if commit.returncode == 0 else None,
-        "machine": {
-            "cpu": models[0] if models else platform.processor(),
-            "cores": psutil.cpu_count(),
-            "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
-            "torch_threads": th.get_num_threads(),
-            "system": platform.platform(),
-        },
-        "versions": {
-            "python": platform.python_version(),
-            "numpy": np.__version__,
-            "torch": th.__version__,
-            "stable_baselines3": stable_baselines3.__version__,
-        },
-        "targets": TARGETS,
-    }
+    settings = {"settings": vars(args), "seeds": [args.seed], "torch_threads": th.get_num_threads(), "targets": TARGETS}
+    return {"benchmark": "replay_memory"} | settings | machine()
 
 
 def main() -> None:

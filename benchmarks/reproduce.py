@@ -29,6 +29,7 @@ from tqdm import tqdm
 
 ROOT = Path(__file__).resolve().parent
 CONFIG = ROOT.parent / "zoo_configs" / "bisim_sac.yml"
+MOST_SEEDS = 50
 LOGGED = ("embedding_norm_mean", "embedding_norm_max", "mu_bd", "mu_rd")
 
 
@@ -85,21 +86,31 @@ def _store_dict(option: str, values: dict[str, Any]) -> list[str]:
     return [option, *(f"{key}:{value!r}" for key, value in values.items())] if values else []
 
 
-def runs_of(name: str, figure: Figure, args: argparse.Namespace) -> list[Run]:
-    """All runs of a figure, seed by seed, so that an early look compares all methods."""
+def adjusted(name: str, args: argparse.Namespace) -> tuple[str, Figure]:
+    """The figure as the command line wants it; what differs from the published one has another name."""
+    figure = FIGURES[name]
     steps = args.steps or figure.steps
+    methods = {key: replace(method, params={**method.params, **args.params}) for key, method in figure.methods.items()}
+    wanted = replace(figure, steps=steps, eval_freq=min(args.eval_freq or figure.eval_freq, steps), methods=methods)
+    if wanted == figure:
+        return name, figure
+    return "_".join([name, f"{steps}steps", f"every{wanted.eval_freq}", *(f"{k}={v}" for k, v in args.params.items())]), wanted
+
+
+def runs_of(name: str, figure: Figure, seeds: int) -> list[Run]:
+    """All runs of a figure, seed by seed, so that an early look compares all methods."""
     return [
-        Run(
-            *(name, panel_name, method_name, panel, replace(method, params={**method.params, **args.params}), seed, steps),
-            *(min(args.eval_freq or figure.eval_freq, steps), figure.eval_episodes),
-        )
-        for seed in range(args.seeds or figure.seeds)
+        Run(name, panel_name, method_name, panel, method, seed, figure.steps, figure.eval_freq, figure.eval_episodes)
+        for seed in range(seeds)
         for panel_name, panel in figure.panels.items()
         for method_name, method in figure.methods.items()
-        if panel_name in (args.panels or figure.panels)
-        and method_name in (args.methods or figure.methods)
-        and panel_name in (method.panels or figure.panels)
+        if panel_name in (method.panels or figure.panels)
     ]
+
+
+def ended(runs: list[Run], out: Path) -> list[dict[str, Any]]:
+    """The results that are there."""
+    return [result for run in runs if (result := finished(out / run.figure / f"{run.name}.json", run.identity))]
 
 
 # --- what a worker does; it reaches other machines by value, and imports only what is installed there
@@ -218,9 +229,9 @@ def backend(args: argparse.Namespace) -> Any:
     return joblib.parallel_config(backend="loky", n_jobs=args.jobs)
 
 
-def sweep(todo: list[Run], args: argparse.Namespace, splits: tuple[str, ...], done: int) -> None:
+def sweep(todo: list[Run], args: argparse.Namespace, out: Path, splits: tuple[str, ...], done: int) -> None:
     measured = machine()  # the code that the workers load, whatever is committed while they run
-    work, out = args.work.resolve(), args.out.resolve()
+    work, out = args.work.resolve(), out.resolve()
     tasks = [
         joblib.delayed(train)(
             run.command(work / run.figure / run.name),
@@ -249,7 +260,9 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=joblib.cpu_count(), help="local processes (default: %(default)s)")
     parser.add_argument("--backend", choices=("loky", "dask"), default="loky", help="local processes, or a Dask cluster")
     parser.add_argument("--scheduler", help="address of the Dask scheduler, host:port; its workers need --nthreads 1")
-    parser.add_argument("--out", type=Path, default=ROOT / "results", help="results (default: benchmarks/results)")
+    parser.add_argument(
+        "--out", type=Path, help="results (default: benchmarks/results; for other settings than the figure's, WORK/results)"
+    )
     parser.add_argument("--work", type=Path, default=Path("logs/reproduce"), help="run folders (default: %(default)s)")
     parser.add_argument("--dry-run", action="store_true", help="show the commands and how long they should take")
     parser.add_argument("--only-draw", action="store_true", help="curves and tables of the runs that have ended")
@@ -268,27 +281,31 @@ def parse_arguments() -> argparse.Namespace:
 
 def main() -> None:
     args = parse_arguments()
-    figure = FIGURES[args.figure]
-    out = args.out / args.figure
-    runs = runs_of(args.figure, figure, args)
-    results = {run: result for run in runs if (result := finished(out / f"{run.name}.json", run.identity))}
-    todo = [run for run in runs if run not in results]
-    hours = seconds_left(todo, list(results.values()), figure) / 3600
+    name, figure = adjusted(args.figure, args)
+    out = args.out or (ROOT / "results" if figure == FIGURES[args.figure] else args.work / "results")
+    runs = [
+        run
+        for run in runs_of(name, figure, args.seeds or figure.seeds)
+        if run.panel_name in (args.panels or figure.panels) and run.method_name in (args.methods or figure.methods)
+    ]
+    todo = [run for run in runs if not ended([run], out)]
+    done = ended(runs, out)
+    hours = seconds_left(todo, done, figure) / 3600
     left = f"the rest takes {hours:.1f} hours of one core" if todo else "nothing is left to run"
-    print(f"{len(results)} of {len(runs)} runs have ended; {left}.", file=sys.stderr)
+    print(f"{len(done)} of {len(runs)} runs have ended; {left}.", file=sys.stderr)
     if args.dry_run:
         for run in todo:
             command = run.command(args.work / run.figure / run.name)
             print(shlex.join(["python", "-m", "sb3_robust_bisim", *command]).replace(f"{Path.cwd()}/", ""))
         return
     if todo and not args.only_draw:
-        sweep(todo, args, figure.splits, sum(run.steps for run in results))
-    results = {run: result for run in runs if (result := finished(out / f"{run.name}.json", run.identity))}
-    if not results:
+        sweep(todo, args, out, figure.splits, sum(result["steps"] for result in done))
+    done = ended(runs_of(name, figure, MOST_SEEDS), out)  # also what earlier sweeps have left
+    if not done:
         sys.exit("No run has ended yet.")
-    draw(list(results.values()), figure, out)
-    summary = tables(list(results.values()), figure, out)
-    print(json.dumps({"benchmark": "reproduce", "figure": args.figure, "runs": len(results), "of": len(runs), **summary}))
+    draw(done, figure, out / name)
+    summary = tables(done, figure, out / name)
+    print(json.dumps({"benchmark": "reproduce", "figure": name, "runs": len(done), "results": str(out / name), **summary}))
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ SWEEP = [
 
 
 def results(folder: Path) -> dict[str, dict]:
-    return {path.stem: json.loads(path.read_text()) for path in (folder / "results" / "cartpole").glob("*.json")}
+    return {path.stem: json.loads(path.read_text()) for path in folder.glob("results/*/*.json")}
 
 
 @contextmanager
@@ -88,7 +88,7 @@ def test_a_sweep_on_dask_survives_the_death_of_a_worker_and_gives_the_numbers_of
         arguments = command(tmp_path, *SWEEP, "--backend", "dask", "--scheduler", address)
         with subprocess.Popen(arguments, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
             # both workers are in the middle of a run, with something to go on from
-            wait_until(lambda: len(list(tmp_path.glob("work/cartpole/*/checkpoint.pkl"))) == 2, process)
+            wait_until(lambda: len(list(tmp_path.glob("work/*/*/checkpoint.pkl"))) == 2, process)
             workers[0].send_signal(signal.SIGKILL)
             assert process.wait(timeout=600) == 0
     expected, found = results(local), results(tmp_path)
@@ -96,7 +96,7 @@ def test_a_sweep_on_dask_survives_the_death_of_a_worker_and_gives_the_numbers_of
         name: run["evaluations"] for name, run in expected.items()
     }
     assert len(found) == 6
-    logs = [path.read_text() for path in tmp_path.glob("work/cartpole/*/log.txt")]
+    logs = [path.read_text() for path in tmp_path.glob("work/*/*/log.txt")]
     assert sum("Going on from step" in log for log in logs) == 1
     assert all(log.count("Saving to") == 1 for log in logs)
 
@@ -104,20 +104,21 @@ def test_a_sweep_on_dask_survives_the_death_of_a_worker_and_gives_the_numbers_of
 def test_a_sweep_goes_on_from_where_it_was_killed_and_ends_with_the_same_numbers(local, tmp_path) -> None:
     arguments = command(tmp_path, *SWEEP, "--jobs", "2")
     with subprocess.Popen(arguments, env=ENVIRONMENT, stderr=subprocess.DEVNULL, start_new_session=True) as process:
-        wait_until(lambda: results(tmp_path) and list(tmp_path.glob("work/cartpole/*/checkpoint.pkl")), process)
+        wait_until(lambda: results(tmp_path) and list(tmp_path.glob("work/*/*/checkpoint.pkl")), process)
         os.killpg(process.pid, signal.SIGKILL)
-    ended = {path: path.stat().st_mtime_ns for path in tmp_path.glob("results/cartpole/*.json")}
+    ended = {path: path.stat().st_mtime_ns for path in tmp_path.glob("results/*/*.json")}
     assert 1 <= len(ended) < 6
     assert reproduce(tmp_path, *SWEEP, "--jobs", "2").returncode == 0
     assert {name: run["evaluations"] for name, run in results(tmp_path).items()} == {
         name: run["evaluations"] for name, run in results(local).items()
     }
     assert {path: path.stat().st_mtime_ns for path in ended} == ended, "a finished run was run again"
-    assert any("Going on from step" in path.read_text() for path in tmp_path.glob("work/cartpole/*/log.txt"))
+    assert any("Going on from step" in path.read_text() for path in tmp_path.glob("work/*/*/log.txt"))
 
 
 def test_a_finished_sweep_has_curves_a_csv_and_a_table_and_nothing_left_to_do(local) -> None:
-    folder = local / "results" / "cartpole"
+    (folder,) = (local / "results").iterdir()
+    assert folder.name == "cartpole_400steps_every100_learning_starts=100_initial_gradient_steps=20_batch_size=32"
     assert (folder / "curves.png").read_bytes().startswith(b"\x89PNG")
     assert "mean_return,N_m=2,normed-IR-ID,3,400," in (folder / "curves.csv").read_text()
     assert "| N_m=2 | normed-IR-ID | 3 |" in (folder / "table.md").read_text()

@@ -123,14 +123,15 @@ def tables(results: list[Result], figure: Figure, out: Path) -> dict[str, Any]:
     for panel in figure.panels:
         ends = {m: series(runs, "return")[1][:, -1] for m in figure.methods if (runs := of(results, panel=panel, method=m))}
         panels[panel] = {m: _ending(of(results, panel=panel, method=m), final, ends.get(FULL)) for m, final in ends.items()}
-    splits = [f"on {split} clips" for split in figure.splits]
-    heads = ["task", "method", "runs", "last return ± s.e.", "IQM [95 %]", "P(full is better) [95 %]", *splits, "largest norm"]
+    splits = list(dict.fromkeys(split for panel in figure.panels.values() for split in panel.splits))
+    played = [f"final agent on {split} clips" for split in splits]
+    heads = ["task", "method", "runs", "last return ± s.e.", "IQM [95 %]", "P(full is better) [95 %]", *played, "largest norm"]
     lines = [" | ".join(["", *heads, "minutes", ""]).strip(), "|---" * (len(heads) + 1) + "|"]
     for panel, methods in panels.items():
         for method, row in methods.items():
             error = "" if row["standard_error"] is None else f" ± {row['standard_error']}"
             better = "{} [{}, {}]".format(*row["full_is_better"]) if method != FULL and "full_is_better" in row else ""
-            played = [", ".join(map(str, row.get(f"final_return_{split}", []))) for split in figure.splits]
+            played = [", ".join(map(str, row.get(f"final_return_{split}", []))) for split in splits]
             cells = [panel, method, row["runs"], f"{row['mean']}{error}", "{} [{}, {}]".format(*row["iqm"]), better, *played]
             lines.append(" | ".join(["", *map(str, cells), str(row["largest_norm"]), str(row["minutes"]), ""]).strip())
     measured = sorted({f"commit {r['commit']}, {r['machine']}, torch {r['versions']['torch']}" for r in results})

@@ -11,11 +11,16 @@ SWINGUP_PIXELS = "robust_bisim/cartpole-swingup-pixels-v0"
 
 @dataclass(frozen=True)
 class Panel:
-    """A task: environment, its arguments in place of the configuration's (none: as there), and variants laid over it."""
+    """
+    A task: environment, its arguments in place of the configuration's (none: as there), and variants laid over it.
+
+    :param splits: clips in front of which the final agent is played, for video
+    """
 
     env_id: str
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     variants: tuple[str, ...] = ()
+    splits: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -32,7 +37,6 @@ class Figure:
     """
     :param rows: what is drawn over the steps, keys of ``_aggregate.QUANTITIES``
     :param seconds_per_1000_steps: of one run on one core, until finished runs tell better
-    :param splits: clips on which the final agent is played, for video
     """
 
     panels: dict[str, Panel]
@@ -43,7 +47,6 @@ class Figure:
     eval_episodes: int
     seconds_per_1000_steps: float
     rows: tuple[str, ...] = ("mean_return", "iqm_return", "embedding_norm_max")
-    splits: tuple[str, ...] = ()
 
 
 def _variants(*names: str, **params: Any) -> dict[str, Method]:
@@ -97,10 +100,12 @@ FIGURES = {
         *(3, 160_000, 8000, 5, 3),
     ),
     "dmc_pixels": Figure(
-        {"video": Panel(SWINGUP_PIXELS, variants=("small",)), "clean": Panel(SWINGUP_PIXELS, variants=("clean", "small"))},
+        {
+            "video": Panel(SWINGUP_PIXELS, variants=("small",), splits=("train", "eval")),
+            "clean": Panel(SWINGUP_PIXELS, variants=("clean", "small")),
+        },
         _variants("SAC", "normed-IR-ID"),
         *(2, 65_000, 4000, 5, 25),
-        splits=("train", "eval"),
     ),
     "bf16": Figure(
         _noisy(CARTPOLE, 2),

@@ -133,10 +133,14 @@ def train(command: list[str], folder: Path, result_path: Path, identity: dict, m
     with FileLock(folder.with_suffix(".lock")):  # a scheduler may take a worker for dead that is not
         if result := finished(result_path, identity):
             return result
-        if not (folder / "checkpoint.pkl").exists():
+        if (folder / "checkpoint.pkl").exists():
+            begun = json.loads((folder / "measured.json").read_text())
+            if not begun["commit"].endswith(measured["commit"]):
+                measured = {**measured, "commit": f"{begun['commit']}, then {measured['commit']}"}
+        else:
             shutil.rmtree(folder)
             folder.mkdir()
-            (folder / "measured.json").write_text(json.dumps(measured))
+        (folder / "measured.json").write_text(json.dumps(measured))
         stopped = {}
         with (folder / "log.txt").open("a") as log, contextlib.redirect_stdout(log):
             try:
@@ -145,7 +149,7 @@ def train(command: list[str], folder: Path, result_path: Path, identity: dict, m
                 if "training has stopped" not in str(error):
                     raise
                 stopped = {"stopped": str(error)}
-        result = {**identity, **json.loads((folder / "measured.json").read_text()), **stopped, **collect(folder)}
+        result = {**identity, **measured, **stopped, **collect(folder)}
         if not stopped and steps_of(result)[-1] + identity["eval_freq"] < identity["steps"]:
             raise KeyboardInterrupt  # the zoo ends such a run as if it were complete
         if splits and not stopped:
@@ -229,14 +233,14 @@ def backend(args: argparse.Namespace) -> Any:
     return joblib.parallel_config(backend="loky", n_jobs=args.jobs)
 
 
-def sweep(todo: list[Run], args: argparse.Namespace, out: Path, splits: tuple[str, ...], done: int) -> None:
+def sweep(todo: list[Run], args: argparse.Namespace, out: Path, done: int) -> None:
     measured = machine()  # the code that the workers load, whatever is committed while they run
     work, out = args.work.resolve(), out.resolve()
     tasks = [
         joblib.delayed(train)(
             run.command(work / run.figure / run.name),
             *(work / run.figure / run.name, out / run.figure / f"{run.name}.json"),
-            *(run.identity, measured, splits),
+            *(run.identity, measured, run.panel.splits),
         )
         for run in todo
     ]
@@ -299,7 +303,7 @@ def main() -> None:
             print(shlex.join(["python", "-m", "sb3_robust_bisim", *command]).replace(f"{Path.cwd()}/", ""))
         return
     if todo and not args.only_draw:
-        sweep(todo, args, out, figure.splits, sum(result["steps"] for result in done))
+        sweep(todo, args, out, sum(result["steps"] for result in done))
     done = ended(runs_of(name, figure, MOST_SEEDS), out)  # also what earlier sweeps have left
     if not done:
         sys.exit("No run has ended yet.")

@@ -132,7 +132,15 @@ def tables(results: list[Result], figure: Figure, out: Path) -> dict[str, Any]:
             error = "" if row["standard_error"] is None else f" ± {row['standard_error']}"
             better = "{} [{}, {}]".format(*row["full_is_better"]) if method != FULL and "full_is_better" in row else ""
             played = [", ".join(map(str, row.get(f"final_return_{split}", []))) for split in splits]
-            cells = [panel, method, row["runs"], f"{row['mean']}{error}", "{} [{}, {}]".format(*row["iqm"]), better, *played]
+            cells = [
+                panel,
+                method,
+                row["runs"],
+                f"{row['mean']}{error}",
+                "{} [{}, {}]".format(*row["iqm"]) if row["runs"] > 1 else row["iqm"][0],
+                better,
+                *played,
+            ]
             lines.append(" | ".join(["", *map(str, cells), str(row["largest_norm"]), str(row["minutes"]), ""]).strip())
     measured = sorted({f"commit {r['commit']}, {r['machine']}, torch {r['versions']['torch']}" for r in results})
     seeds = sorted({r["seed"] for r in results})
@@ -152,13 +160,13 @@ def _ending(runs: list[Result], final: np.ndarray, full: np.ndarray | None) -> d
         "runs": len(final),
         "mean": _short(final.mean()),
         "standard_error": _short(final.std(ddof=1) / np.sqrt(len(final)) if len(final) > 1 else np.nan),
-        "iqm": [_short(value) for value in (iqm[""][0], *interval[""][:, 0])],
+        "iqm": [_short(value) for value in (iqm[""][0], *(interval[""][:, 0] if len(final) > 1 else [np.nan, np.nan]))],
         "final_returns": [_short(value) for value in final],
         "largest_norm": _short(max(e.get("embedding_norm_max", 0.0) for run in runs for e in run["evaluations"])),
         "minutes": _short(np.median([run["seconds"] for run in runs]) / 60),
         "stopped": sum("stopped" in run for run in runs),
     }
-    if full is not None:
+    if full is not None and min(len(full), len(final)) > 1:
         pair = {"": (full[:, None], final[:, None])}
         better, interval = estimate(pair, metrics.probability_of_improvement, reps=REPS, random_state=generator)
         row["full_is_better"] = [_short(value) for value in (better[""], *np.ravel(interval[""]))]

@@ -28,12 +28,13 @@ def of(results: list[Result], **wanted: Any) -> list[Result]:
 
 
 def series(runs: list[Result], key: str) -> tuple[np.ndarray, np.ndarray]:
-    """Steps and (runs, evaluations) values, as far as all runs have got; "return" is the mean of the episodes."""
-    length = min(len(run["evaluations"]) for run in runs)
-    rows = [
-        [np.mean(e["returns"]) if key == "return" else e.get(key, np.nan) for e in run["evaluations"][:length]] for run in runs
-    ]
-    return np.array([evaluation["step"] for evaluation in runs[0]["evaluations"][:length]]), np.array(rows, dtype=float)
+    """Steps and (runs, evaluations) values. "return" is the mean of the episodes; a run that broke off stays where it was."""
+    longest = max((run["evaluations"] for run in runs), key=len)
+    rows = []
+    for run in runs:
+        row = [np.mean(e["returns"]) if key == "return" else e.get(key, np.nan) for e in run["evaluations"]]
+        rows.append(row + [row[-1]] * (len(longest) - len(row)))
+    return np.array([evaluation["step"] for evaluation in longest]), np.array(rows, dtype=float)
 
 
 def mean_curve(runs: list[Result], key: str) -> Curve:
@@ -144,7 +145,14 @@ def tables(results: list[Result], figure: Figure, out: Path) -> dict[str, Any]:
             lines.append(" | ".join(["", *map(str, cells), str(row["largest_norm"]), str(row["minutes"]), ""]).strip())
     measured = sorted({f"commit {r['commit']}, {r['machine']}, torch {r['versions']['torch']}" for r in results})
     seeds = sorted({r["seed"] for r in results})
+    broken = [
+        f"{r['panel']} {r['method']} seed {r['seed']} at step {r['evaluations'][-1]['step']}"
+        for r in results
+        if "stopped" in r
+    ]
     lines += ["", f"Seeds {seeds[0]} to {seeds[-1]}; {'; '.join(measured)}.", ""]
+    if broken:
+        lines += [f"Broke off with a loss that was not finite: {', '.join(broken)}.", ""]
     with atomic_path(out / "table.md") as temporary:
         temporary.write_text("\n".join(lines))
     return {"panels": panels}

@@ -19,7 +19,8 @@ warnings.filterwarnings("ignore", "random_state is deprecated", FutureWarning)
 
 Result = dict[str, Any]
 Curve = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # steps, middle, low, high
-REPS = 1000  # bootstrap samples
+REPS, REPS_OF_CURVES = 1000, 200  # bootstrap samples
+MANY = 4  # runs from which on an interquartile mean leaves something out and an interval means something
 FULL = "normed-IR-ID"
 
 
@@ -28,12 +29,15 @@ def of(results: list[Result], **wanted: Any) -> list[Result]:
 
 
 def series(runs: list[Result], key: str) -> tuple[np.ndarray, np.ndarray]:
-    """Steps and (runs, evaluations) values. "return" is the mean of the episodes; a run that broke off stays where it was."""
+    """
+    Steps and (runs, evaluations) values. "return" is the mean of the episodes; the return of a run that broke off stays where
+    it was, all else of it is unknown from there on.
+    """
     longest = max((run["evaluations"] for run in runs), key=len)
     rows = []
     for run in runs:
         row = [np.mean(e["returns"]) if key == "return" else e.get(key, np.nan) for e in run["evaluations"]]
-        rows.append(row + [row[-1]] * (len(longest) - len(row)))
+        rows.append(row + [row[-1] if key == "return" else np.nan] * (len(longest) - len(row)))
     return np.array([evaluation["step"] for evaluation in longest]), np.array(rows, dtype=float)
 
 
@@ -51,19 +55,21 @@ def iqm_curve(runs: list[Result], key: str) -> Curve:
     def iqm(x: np.ndarray) -> np.ndarray:
         return np.array([metrics.aggregate_iqm(x[..., i]) for i in range(x.shape[-1])])
 
-    middle, intervals = library.get_interval_estimates(scores, iqm, reps=REPS // 5, random_state=np.random.RandomState(0))
+    middle, intervals = library.get_interval_estimates(scores, iqm, reps=REPS_OF_CURVES, random_state=np.random.RandomState(0))
     return steps, middle[""], *intervals[""]
 
 
 def median_curve(runs: list[Result], key: str) -> Curve:
     """Median and range: what grows without bound has no useful mean."""
     steps, values = series(runs, key)
-    return steps, np.median(values, axis=0), values.min(axis=0), values.max(axis=0)
+    values = np.ma.masked_invalid(values)
+    return steps, np.ma.median(values, axis=0), values.min(axis=0), values.max(axis=0)
 
 
 def ratio_curve(runs: list[Result], key: str) -> Curve:
+    """Mean over the runs of mu_bd / mu_rd, where any reward has been found."""
     (steps, mu_bd), (_, mu_rd) = series(runs, "mu_bd"), series(runs, "mu_rd")
-    middle = np.nanmean(np.divide(mu_bd, mu_rd, out=np.full_like(mu_bd, np.nan), where=mu_rd > 0), axis=0)
+    middle = np.ma.mean(np.ma.masked_invalid(mu_bd) / np.ma.masked_less_equal(np.ma.masked_invalid(mu_rd), 0), axis=0)
     return steps, middle, middle, middle
 
 
@@ -72,7 +78,7 @@ QUANTITIES: dict[str, tuple[Callable[[list[Result], str], Curve], str, str, str]
     "mean_return": (mean_curve, "return", "return, mean ± standard error", "linear"),
     "iqm_return": (iqm_curve, "return", "return, IQM, 95 % interval", "linear"),
     "embedding_norm_max": (median_curve, "embedding_norm_max", "largest norm, median and range", "log"),
-    "mu_ratio": (ratio_curve, "mu_bd", "$\\mu_{bd} / \\mu_{rd}$", "log"),
+    "mu_ratio": (ratio_curve, "mu_bd", "$\\mu_{bd} / \\mu_{rd}$ (dashed: $c_R / (1 - c_T)$)", "log"),
 }
 
 
@@ -88,14 +94,17 @@ def draw(results: list[Result], figure: Figure, out: Path) -> None:
                 if runs := of(results, panel=panel, method=method):
                     curve, key, _, _ = QUANTITIES[quantity]
                     lines = curve(runs, key)
-                    _draw_curve(axes[row, column], lines, f"{method} ({len(runs)})", f"C{color}")
+                    _draw_curve(axes[row, column], lines, method, f"C{color}")
+                    if quantity == "mu_ratio":
+                        target = np.nanmax(series(runs, "mu_ratio_target")[1])
+                        axes[row, column].axhline(target, color=f"C{color}", linestyle="--", linewidth=1)
                     values = zip(*lines, strict=True)
                     table += [[quantity, panel, method, len(runs), *(f"{v:.6g}" for v in point)] for point in values]
             _label(axes[row, column], quantity, panel if row == 0 else "", column == 0)
     for column in range(len(panels)):
         axes[-1, column].set_xlabel("environment steps")
     handles = {label: line for ax in axes.flat for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    picture.legend(handles.values(), handles, loc="outside lower center", ncols=min(len(handles), 4), title="method (runs)")
+    picture.legend(handles.values(), handles, loc="outside lower center", ncols=min(len(handles), 4))
     with atomic_path(out / "curves.png") as temporary:
         picture.savefig(temporary, dpi=90, format="png")
     with atomic_path(out / "curves.csv") as temporary, temporary.open("w", newline="") as file:
@@ -138,7 +147,7 @@ def tables(results: list[Result], figure: Figure, out: Path) -> dict[str, Any]:
                 method,
                 row["runs"],
                 f"{row['mean']}{error}",
-                "{} [{}, {}]".format(*row["iqm"]) if row["runs"] > 1 else row["iqm"][0],
+                "{} [{}, {}]".format(*row["iqm"]) if row["runs"] >= MANY else "",
                 better,
                 *played,
             ]
@@ -168,13 +177,13 @@ def _ending(runs: list[Result], final: np.ndarray, full: np.ndarray | None) -> d
         "runs": len(final),
         "mean": _short(final.mean()),
         "standard_error": _short(final.std(ddof=1) / np.sqrt(len(final)) if len(final) > 1 else np.nan),
-        "iqm": [_short(value) for value in (iqm[""][0], *(interval[""][:, 0] if len(final) > 1 else [np.nan, np.nan]))],
+        "iqm": [_short(value) for value in (iqm[""][0], *(interval[""][:, 0] if len(final) >= MANY else [np.nan, np.nan]))],
         "final_returns": [_short(value) for value in final],
         "largest_norm": _short(max(e.get("embedding_norm_max", 0.0) for run in runs for e in run["evaluations"])),
         "minutes": _short(np.median([run["seconds"] for run in runs]) / 60),
         "stopped": sum("stopped" in run for run in runs),
     }
-    if full is not None and min(len(full), len(final)) > 1:
+    if full is not None and min(len(full), len(final)) >= MANY:
         pair = {"": (full[:, None], final[:, None])}
         better, interval = estimate(pair, metrics.probability_of_improvement, reps=REPS, random_state=generator)
         row["full_is_better"] = [_short(value) for value in (better[""], *np.ravel(interval[""]))]

@@ -13,6 +13,7 @@ import os
 import shlex
 import shutil
 import sys
+import traceback
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,16 +22,18 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # runs are spread over processes,
 
 import joblib
 import numpy as np
+import yaml
 from _aggregate import draw, tables
 from _figures import FIGURES, Figure, Method, Panel
 from _machine import machine
-from rl_zoo3.utils import StoreDict
 from tqdm import tqdm
+
+from sb3_robust_bisim.zoo import check_keys
 
 ROOT = Path(__file__).resolve().parent
 CONFIG = ROOT.parent / "zoo_configs" / "bisim_sac.yml"
 MOST_SEEDS = 50
-LOGGED = ("embedding_norm_mean", "embedding_norm_max", "mu_bd", "mu_rd")
+LOGGED = ("embedding_norm_mean", "embedding_norm_max", "mu_bd", "mu_rd", "mu_ratio_target")
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +56,8 @@ class Run:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """What a result must agree with to be this run's."""
-        return {
+        """What a result must agree with to be this run's, as JSON gives it back."""
+        identity = {
             "figure": self.figure,
             "panel": self.panel_name,
             "method": self.method_name,
@@ -67,6 +70,7 @@ class Run:
             "eval_freq": self.eval_freq,
             "eval_episodes": self.eval_episodes,
         }
+        return json.loads(json.dumps(identity))
 
     def command(self, folder: Path) -> list[str]:
         """What follows ``python -m sb3_robust_bisim``."""
@@ -123,40 +127,65 @@ def finished(path: Path, identity: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def train(command: list[str], folder: Path, result_path: Path, identity: dict, measured: dict, splits: tuple) -> dict:
-    """One run, from its checkpoint if it has one, or its result if it has ended."""
+    """One run, from its checkpoint if it has one, or its result if it has ended; what went wrong under "failed"."""
     from filelock import FileLock
-
-    from sb3_robust_bisim.atomic import atomic_path
-    from sb3_robust_bisim.zoo import main
 
     folder.mkdir(parents=True, exist_ok=True)
     with FileLock(folder.with_suffix(".lock")):  # a scheduler may take a worker for dead that is not
         if result := finished(result_path, identity):
             return result
-        if (folder / "checkpoint.pkl").exists():
-            begun = json.loads((folder / "measured.json").read_text())
-            if not begun["commit"].endswith(measured["commit"]):
-                measured = {**measured, "commit": f"{begun['commit']}, then {measured['commit']}"}
-        else:
-            shutil.rmtree(folder)
-            folder.mkdir()
-        (folder / "measured.json").write_text(json.dumps(measured))
-        stopped = {}
-        with (folder / "log.txt").open("a") as log, contextlib.redirect_stdout(log):
-            try:
-                main(command)
-            except ValueError as error:  # an embedding that explodes may end in a loss that is not finite: a result too
-                if "training has stopped" not in str(error):
-                    raise
-                stopped = {"stopped": str(error)}
-        result = {**identity, **measured, **stopped, **collect(folder)}
-        if not stopped and steps_of(result)[-1] + identity["eval_freq"] < identity["steps"]:
-            raise KeyboardInterrupt  # the zoo ends such a run as if it were complete
-        if splits and not stopped:
-            result["final_return_by_split"] = {split: play(folder, identity, split) for split in splits}
-        with atomic_path(result_path) as temporary:
-            temporary.write_text(json.dumps(result, indent=None).replace('{"step"', '\n{"step"') + "\n")
+        try:
+            measured = begin(folder, measured)
+            stopped = learn(command, folder)
+            result = {**identity, **measured, **stopped, **collect(folder)}
+            if not stopped and steps_of(result)[-1] + identity["eval_freq"] <= identity["steps"]:
+                raise KeyboardInterrupt  # the zoo ends such a run as if it were complete
+            write(folder / "trained.json", json.dumps(stopped))
+            if splits and not stopped:
+                result["final_return_by_split"] = {split: play(folder, identity, split) for split in splits}
+        except Exception:  # the other runs go on
+            return {**identity, "failed": traceback.format_exc()}
+        write(result_path, json.dumps(result, indent=None).replace('{"step"', '\n{"step"') + "\n")
         return result
+
+
+def write(path: Path, text: str) -> None:
+    from sb3_robust_bisim.atomic import atomic_path
+
+    with atomic_path(path) as temporary:
+        temporary.write_text(text)
+
+
+def begin(folder: Path, measured: dict) -> dict:
+    """Clear away what cannot be gone on with, and say which code and machine the run is made with."""
+    path = folder / "measured.json"
+    if (folder / "checkpoint.pkl").exists() or (folder / "trained.json").exists():
+        begun = json.loads(path.read_text())["commit"] if path.exists() else "unknown"
+        if not begun.endswith(measured["commit"]):
+            measured = {**measured, "commit": f"{begun}, then {measured['commit']}"}
+    else:
+        shutil.rmtree(folder)
+    write(path, json.dumps(measured))
+    return measured
+
+
+def learn(command: list[str], folder: Path) -> dict[str, str]:
+    """Train to the end, unless that has been done; under "stopped" why it ended before."""
+    from sb3_robust_bisim.zoo import main
+
+    if (folder / "trained.json").exists():
+        return json.loads((folder / "trained.json").read_text())
+    stopped = {}
+    with (folder / "log.txt").open("a") as log, contextlib.redirect_stdout(log):
+        try:
+            main(command)
+        except ValueError as error:  # an embedding that explodes may end in a loss that is not finite: a result too
+            if "training has stopped" not in str(error):
+                raise
+            stopped = {"stopped": str(error)}
+    if not stopped and (folder / "checkpoint.pkl").exists():
+        raise KeyboardInterrupt  # likewise: a run that has ended leaves none
+    return stopped
 
 
 def steps_of(result: dict[str, Any]) -> list[int]:
@@ -165,7 +194,6 @@ def steps_of(result: dict[str, Any]) -> list[int]:
 
 def collect(folder: Path) -> dict[str, Any]:
     """What the zoo and TensorBoard have recorded of a run, evaluation by evaluation."""
-    import yaml
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     (run,) = (folder / "bisim_sac").glob("*_1")
@@ -196,7 +224,6 @@ def collect(folder: Path) -> dict[str, Any]:
 
 def play(folder: Path, identity: dict, split: str, n_episodes: int = 20) -> list[float]:
     """Returns of the final agent in front of the clips of one split."""
-    import yaml
     from stable_baselines3.common.env_util import make_vec_env
     from stable_baselines3.common.evaluation import evaluate_policy
     from stable_baselines3.common.vec_env import VecFrameStack
@@ -233,7 +260,9 @@ def backend(args: argparse.Namespace) -> Any:
     return joblib.parallel_config(backend="loky", n_jobs=args.jobs)
 
 
-def sweep(todo: list[Run], args: argparse.Namespace, out: Path, done: int) -> None:
+def sweep(todo: list[Run], args: argparse.Namespace, out: Path, done: int) -> list[str]:
+    """Do all runs; the names of those that failed."""
+    failed: list[str] = []
     measured = machine()  # the code that the workers load, whatever is committed while they run
     work, out = args.work.resolve(), out.resolve()
     tasks = [
@@ -246,8 +275,34 @@ def sweep(todo: list[Run], args: argparse.Namespace, out: Path, done: int) -> No
     ]
     with tqdm(total=done + sum(run.steps for run in todo), initial=done, unit="step", file=sys.stderr) as bar, backend(args):
         for result in joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="all")(tasks):
-            bar.set_postfix_str(f"{result['panel']} {result['method']} seed {result['seed']}")
+            name = f"{result['panel']} {result['method']} seed {result['seed']}"
+            bar.set_postfix_str(name)
+            if "failed" in result:
+                failed.append(name)
+                tqdm.write(f"{name} failed:\n{result['failed']}", file=sys.stderr)
             bar.update(result["steps"])
+    return failed
+
+
+def check_alike(results: list[dict]) -> None:
+    """Curves must not mix runs from before and after a change of the configuration."""
+    first: dict[tuple[str, str], dict] = {}
+    for result in results:
+        other = first.setdefault((result["panel"], result["method"]), result)
+        if result["arguments"] != other["arguments"]:
+            sys.exit(
+                f"{result['panel']} {result['method']}: seeds {other['seed']} and {result['seed']} were run with different "
+                "settings, the configuration has changed in between. Move the older results away."
+            )
+
+
+def setting(text: str) -> tuple[str, Any]:
+    """``batch_size:128`` or ``distance:l1``"""
+    key, colon, value = text.partition(":")
+    check_keys({key: value}, "--params")
+    if not colon:
+        raise ValueError(f"{text}: write KEY:VALUE")
+    return key, yaml.safe_load(value)
 
 
 def parse_arguments() -> argparse.Namespace:
@@ -256,9 +311,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, help="how many (default: the figure's)")
     parser.add_argument("--steps", type=int, help="of the environment per run (default: the figure's)")
     parser.add_argument("--eval-freq", type=int, help="steps between evaluations and checkpoints (default: the figure's)")
-    parser.add_argument(
-        "--params", nargs="+", action=StoreDict, default={}, help="for all methods, batch_size:128 for example"
-    )
+    parser.add_argument("--params", nargs="+", default=[], metavar="KEY:VALUE", help="for all methods, batch_size:128 say")
     parser.add_argument("--panels", nargs="+", help="some of the tasks, N_m=2 for example (default: all)")
     parser.add_argument("--methods", nargs="+", help="some of the methods (default: all)")
     parser.add_argument("--jobs", type=int, default=joblib.cpu_count(), help="local processes (default: %(default)s)")
@@ -271,6 +324,10 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--dry-run", action="store_true", help="show the commands and how long they should take")
     parser.add_argument("--only-draw", action="store_true", help="curves and tables of the runs that have ended")
     args = parser.parse_args()
+    try:
+        args.params = dict(sorted(map(setting, args.params)))
+    except ValueError as error:
+        parser.error(str(error))
     figure = FIGURES[args.figure]
     for option, known in (("panels", figure.panels), ("methods", figure.methods)):
         if unknown := set(getattr(args, option) or ()) - set(known):
@@ -294,22 +351,26 @@ def main() -> None:
     ]
     todo = [run for run in runs if not ended([run], out)]
     done = ended(runs, out)
-    hours = seconds_left(todo, done, figure) / 3600
-    left = f"the rest takes {hours:.1f} hours of one core" if todo else "nothing is left to run"
+    minutes = seconds_left(todo, done, figure) / 60
+    rest = f"{minutes:.0f} minutes" if minutes < 90 else f"{minutes / 60:.1f} hours"
+    left = f"the rest takes {rest} of one core" if todo else "nothing is left to run"
     print(f"{len(done)} of {len(runs)} runs have ended; {left}.", file=sys.stderr)
     if args.dry_run:
         for run in todo:
             command = run.command(args.work / run.figure / run.name)
             print(shlex.join(["python", "-m", "sb3_robust_bisim", *command]).replace(f"{Path.cwd()}/", ""))
         return
+    failed = []
     if todo and not args.only_draw:
-        sweep(todo, args, out, sum(result["steps"] for result in done))
-    done = ended(runs_of(name, figure, MOST_SEEDS), out)  # also what earlier sweeps have left
+        failed = sweep(todo, args, out, sum(result["steps"] for result in done))
+    done = ended(runs_of(name, figure, max(MOST_SEEDS, args.seeds or 0)), out)  # also what earlier sweeps have left
     if not done:
         sys.exit("No run has ended yet.")
+    check_alike(done)
     draw(done, figure, out / name)
     summary = tables(done, figure, out / name)
-    print(json.dumps({"benchmark": "reproduce", "figure": name, "runs": len(done), "results": str(out / name), **summary}))
+    print(json.dumps({"benchmark": "reproduce", "figure": name, "runs": len(done), "failed": failed, **summary}))
+    sys.exit(1 if failed else 0)
 
 
 if __name__ == "__main__":

@@ -3,12 +3,16 @@ Checkpoints from which training goes on as if it had never stopped.
 
 SB3's own ``save`` keeps the agent. Here everything goes into one file that the next number depends on: agent and optimizers,
 replay buffer, environments in the middle of their episodes, callbacks with what they have gathered, and the random generators.
-Learning then gives the same numbers, bit by bit, as a run that was never interrupted. What differs: the wall-clock times,
-and the first line of every output of SB3's logger, whose means begin anew.
+Learning then gives the same numbers, bit by bit, as a run that was never interrupted. What differs: the wall-clock times;
+the first line of every output of SB3's logger, whose means begin anew; and with ``use_sde`` or action noise the exploration,
+whose noise SB3 draws anew whenever ``learn`` is called.
 """
 
 import inspect
+import pickle
+import platform
 import random
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -31,16 +35,18 @@ class Checkpoint(BaseCallback):
     :param path: file to write; it is replaced as a whole
     :param every: environment steps between two checkpoints, all environments together, >= 1
     :param context: anything else to keep, under the same roof: objects shared with the model stay shared
+    :param about: plain values that :func:`read_about` finds without unpickling anything else
     :raises ValueError: for ``every`` < 1; at the start of training, for environments in processes of their own
     """
 
-    def __init__(self, path: str | Path, every: int, context: Any = None) -> None:
+    def __init__(self, path: str | Path, every: int, context: Any = None, about: dict[str, Any] | None = None) -> None:
         super().__init__()
         if every < 1:
             raise ValueError(f"every={every}: there must be at least one step between two checkpoints.")
         self.path = Path(path)
         self.every = every
         self.context = context
+        self.about = about or {}
         self._last = 0
 
     def _on_training_start(self) -> None:
@@ -51,39 +57,59 @@ class Checkpoint(BaseCallback):
     def _on_rollout_start(self) -> None:
         if self.num_timesteps - self._last >= self.every:
             self._last = self.num_timesteps
-            save_checkpoint(self.path, self.model, self.context)
+            save_checkpoint(self.path, self.model, self.context, self.about)
 
     def _on_step(self) -> bool:
         return True
 
 
-def save_checkpoint(path: str | Path, model: BaseAlgorithm, context: Any = None) -> None:
+def save_checkpoint(path: str | Path, model: BaseAlgorithm, context: Any = None, about: dict[str, Any] | None = None) -> None:
     """
     :param path: file to write; an old one stays whole until the new one is
     :param model: between two calls of ``collect_rollouts``, as in :class:`Checkpoint`
     :param context: anything else to keep
+    :param about: plain values for :func:`read_about`
     """
     with atomic_path(path) as temporary, temporary.open("wb") as file:
+        pickle.dump({**(about or {}), "num_timesteps": model.num_timesteps, "versions": _versions()}, file)
         _Pickler(file).dump((model, context, _generator_states()))
+
+
+def read_about(path: str | Path) -> dict[str, Any]:
+    """What was said about a checkpoint when it was written, its ``"num_timesteps"`` and the packages' ``"versions"``."""
+    with Path(path).open("rb") as file:
+        return pickle.load(file)
 
 
 def load_checkpoint(path: str | Path) -> tuple[Any, Any]:
     """
     Bring back a model, and set the global random generators to where they stood.
 
-    Only load files that you trust: unpickling runs code. Learn on with ``reset_num_timesteps=False``.
+    Only load files that you trust: unpickling runs code. Learn on with ``reset_num_timesteps=False``; a logger that was set by
+    hand must be set again.
 
-    :param path: what :func:`save_checkpoint` wrote, with the same versions of the packages
+    :param path: what :func:`save_checkpoint` wrote
     :return: the model with its environments and its replay buffer, and the context
+    :raises ValueError: if it was written with other versions of the packages
     """
     with Path(path).open("rb") as file:
+        there, here = pickle.load(file)["versions"], _versions()
+        if there != here:
+            changes = ", ".join(f"{name} {there.get(name)} there and {here[name]} here" for name in here)
+            raise ValueError(f"{path}: a checkpoint needs the versions that it was written with: {changes}.")
         model, context, (python, numpy, torch, cuda) = cloudpickle.load(file)
+    model._custom_logger = False  # so that learn() makes one
     random.setstate(python)
     np.random.set_state(numpy)  # noqa: NPY002 (SB3 samples with it)
     th.set_rng_state(torch)
     if cuda:
         th.cuda.set_rng_state_all(cuda)
     return model, context
+
+
+def _versions() -> dict[str, str]:
+    packages = ("torch", "numpy", "stable_baselines3", "gymnasium", "sb3_robust_bisim")
+    return {"python": platform.python_version(), **{package: version(package) for package in packages}}
 
 
 def _generator_states() -> tuple[Any, ...]:

@@ -21,11 +21,11 @@ from rl_zoo3.utils import get_class_by_name
 from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_robust_bisim.atomic import atomic_path
 from sb3_robust_bisim.bisim_sac import BisimSAC
-from sb3_robust_bisim.checkpoint import Checkpoint, load_checkpoint
+from sb3_robust_bisim.checkpoint import Checkpoint, load_checkpoint, read_about
 
 ALGO = "bisim_sac"
 DEFAULT_CONFIG = Path("zoo_configs/bisim_sac.yml")
@@ -103,6 +103,7 @@ class BisimExperimentManager(ExperimentManager):
     variants: ClassVar[list[str]] = []
     checkpoint: ClassVar[Path | None] = None
     checkpoint_freq: ClassVar[int] = 10_000
+    seed_given: ClassVar[bool] = False
     tuned: ClassVar[dict[str, Any]] = {}  # hyperparameters of the method that Optuna tunes
     resumed = False
 
@@ -131,31 +132,39 @@ class BisimExperimentManager(ExperimentManager):
         return hyperparams, saved_hyperparams
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
-        if self.checkpoint is not None and self.checkpoint.is_file():
+        if self.checkpoint is None:
+            return super().setup_experiment()
+        if self.vec_env_class is SubprocVecEnv:
+            raise ValueError("--checkpoint with --vec-env subproc: environments in other processes cannot be kept; use dummy.")
+        if self.checkpoint.is_file():
             return self._continue(self.checkpoint)
         experiment = super().setup_experiment()
-        if self.checkpoint is not None and experiment is not None:
-            run = {"settings": self._settings(experiment[1]), "save_path": self.save_path, "callbacks": self.callbacks}
-            self.callbacks.append(Checkpoint(self.checkpoint, self.checkpoint_freq, run))
+        assert experiment is not None  # the command line refuses -optimize
+        run = {"save_path": self.save_path, "callbacks": self.callbacks}
+        about = {"settings": self._settings(experiment[1])}
+        self.callbacks.append(Checkpoint(self.checkpoint, self.checkpoint_freq, run, about))
         return experiment
 
     def _settings(self, hyperparams: dict[str, Any]) -> dict[str, Any]:
         """What must be the same for a run to be continued; it may become longer."""
+        asked = {key: vars(self.args)[key] for key in ("eval_freq", "eval_episodes", "save_freq", "eval_env_kwargs")}
         env_kwargs = {"env_kwargs": self.env_kwargs or hyperparams.get("env_kwargs", {})}
-        seed = self.seed if "--seed" in sys.argv else "random"  # the zoo draws one
-        return {"env": self.env_name, "seed": seed, **hyperparams, **env_kwargs, "n_timesteps": None}
+        seed = self.seed if self.seed_given else "random"  # the zoo draws one
+        return {"env": str(self.env_name), "seed": seed, **hyperparams, **env_kwargs, **asked, "n_timesteps": None}
 
     def _continue(self, checkpoint: Path) -> tuple[BaseAlgorithm, dict[str, Any]]:
         hyperparams, saved_hyperparams = self.read_hyperparameters()
-        here = self._settings(saved_hyperparams)
-        model, run = load_checkpoint(checkpoint)
-        there = run["settings"]
+        about = read_about(checkpoint)
+        here, there = self._settings(saved_hyperparams), about["settings"]
         if differing := sorted(key for key in {*here, *there} if here.get(key) != there.get(key)):
             pairs = ", ".join(f"{key} is {there.get(key)} there and {here.get(key)} here" for key in differing)
             raise ValueError(
                 f"--checkpoint {checkpoint}: it belongs to another run; {pairs}. Name another file, or delete it."
             )
         _, self.env_wrapper, _, self.vec_env_wrapper = self._preprocess_hyperparams(hyperparams)
+        if self.n_timesteps < about["num_timesteps"]:
+            raise ValueError(f"--n-timesteps {self.n_timesteps}: {checkpoint} is at step {about['num_timesteps']} already.")
+        model, run = load_checkpoint(checkpoint)
         self.save_path, self.callbacks = run["save_path"], run["callbacks"]
         self.params_path = f"{self.save_path}/{self.env_name}"
         self.resumed = True
@@ -165,10 +174,10 @@ class BisimExperimentManager(ExperimentManager):
     def learn(self, model: BaseAlgorithm) -> None:
         if not self.resumed:
             return super().learn(model)
-        log_interval = self.log_interval if self.log_interval > -1 else 4
+        log_interval = {-1: 4}.get(self.log_interval, self.log_interval if self.log_interval >= 0 else None)
         try:
             rest = self.n_timesteps - model.num_timesteps
-            model.learn(rest, callback=self.callbacks, log_interval=log_interval, reset_num_timesteps=False)
+            model.learn(rest, self.callbacks, log_interval, reset_num_timesteps=False)  # type: ignore[arg-type]
         except KeyboardInterrupt:  # as in the zoo: what was learned is saved
             pass
         finally:
@@ -285,6 +294,7 @@ def _train_arguments(arguments: list[str]) -> list[str]:
     parser.add_argument(
         "--checkpoint-freq", type=int, default=10_000, metavar="N", help="environment steps (default: %(default)s)"
     )
+    parser.add_argument("--seed", type=int, help="of environments, networks and sampling (default: a random one)")
     parser.add_argument("--algo", default=ALGO, help="RL algorithm (default: %(default)s)")
     parser.add_argument(
         "-conf", "--conf-file", help=f"hyperparameters (default: {DEFAULT_CONFIG} for {ALGO}, if that file is here)"
@@ -295,11 +305,15 @@ def _train_arguments(arguments: list[str]) -> list[str]:
     ours, theirs = parser.parse_known_args(arguments)
     BisimExperimentManager.variants = ours.variants
     BisimExperimentManager.checkpoint, BisimExperimentManager.checkpoint_freq = ours.checkpoint, ours.checkpoint_freq
+    BisimExperimentManager.seed_given = ours.seed is not None
     if ours.checkpoint_freq < 1:
         parser.error(f"--checkpoint-freq {ours.checkpoint_freq}: at least one step must lie between two checkpoints.")
+    if ours.checkpoint is not None and {"-optimize", "--optimize-hyperparameters"} & set(arguments):
+        parser.error("--checkpoint with -optimize: Optuna keeps its trials itself, see --storage.")
     config = ours.conf_file or (str(DEFAULT_CONFIG) if ours.algo == ALGO and DEFAULT_CONFIG.is_file() else None)
     if ours.algo == ALGO and config is None and not {"-h", "--help"} & set(arguments):
         parser.error(f"-conf is needed: {DEFAULT_CONFIG} is not in this folder.")
     if config is not None and config.endswith((".yml", ".yaml")) and not Path(config).is_file():
         parser.error(f"-conf {config}: there is no such file.")
-    return ["--algo", ours.algo, *(["-conf", config] if config else []), *theirs]
+    seed = [] if ours.seed is None else ["--seed", str(ours.seed)]
+    return ["--algo", ours.algo, *(["-conf", config] if config else []), *seed, *theirs]

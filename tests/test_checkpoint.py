@@ -8,11 +8,12 @@ import torch as th
 from small_models import SMALL
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecFrameStack, VecNormalize
 
 from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer, IntrinsicRewardVecEnv, zoo
-from sb3_robust_bisim.checkpoint import Checkpoint, load_checkpoint
+from sb3_robust_bisim.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 
 STEPS = 120
 LEARNING = {**SMALL, "learning_starts": 20, "buffer_size": 200}
@@ -92,15 +93,53 @@ def test_a_checkpoint_needs_steps_in_between() -> None:
         Checkpoint("checkpoint.pkl", 0)
 
 
-def test_the_command_line_refuses_the_checkpoint_of_another_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """A run of the command line that is cut off before it saves its agent, and leaves a checkpoint at step 50."""
     monkeypatch.setattr("sys.argv", ["sb3_robust_bisim"])
+    monkeypatch.setattr(zoo.BisimExperimentManager, "save_trained_model", lambda *_: None)
     common = [
-        *("train", "--env", "robust_bisim/SparseCartPole-v0", "--n-timesteps", "60", "--eval-freq", "-1", "--verbose", "0"),
+        *("train", "--env", "robust_bisim/SparseCartPole-v0", "--eval-freq", "-1", "--verbose", "0", "--n-timesteps", "60"),
         *("--log-folder", str(tmp_path), "--checkpoint", str(tmp_path / "checkpoint.pkl"), "--checkpoint-freq", "50"),
+        *("-params", "learning_starts:20", "batch_size:8"),
     ]
-    monkeypatch.setattr(zoo.BisimExperimentManager, "save_trained_model", lambda *_: None)  # as if killed before
-    zoo.main([*common, "-params", "learning_starts:20", "batch_size:8"])
-    before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(ValueError, match=r"batch_size is 8 there and 16 here\. Name another file"):
-        zoo.main([*common, "-params", "learning_starts:20", "batch_size:16"])
-    assert sorted(tmp_path.rglob("*")) == before
+    zoo.main([*common, "--seed", "3"])
+    return common
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (["--seed=4"], r"seed is 3 there and 4 here\. Name another file"),
+        (["--seed", "3", "--eval-episodes", "2"], "eval_episodes is 5 there and 2 here"),
+        (["--seed", "3", "-params", "learning_starts:20", "batch_size:16"], "batch_size is 8 there and 16 here"),
+        (["--seed", "3", "--n-timesteps", "40"], r"--n-timesteps 40: .* is at step 50 already"),
+    ],
+)
+def test_the_command_line_refuses_the_checkpoint_of_another_run(
+    command: list[str], changed: list[str], message: str, tmp_path: Path
+) -> None:
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(ValueError, match=message):
+        zoo.main([*command, *changed])
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_a_run_that_goes_on_may_become_longer(command: list[str], capsys: pytest.CaptureFixture) -> None:
+    zoo.main([*command, "--seed", "3", "--n-timesteps", "80"])
+    assert "Going on from step 50" in capsys.readouterr().out
+
+
+def test_a_checkpoint_of_other_versions_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_robust_bisim.checkpoint._versions", lambda: {"torch": "1.0"})
+    save_checkpoint(tmp_path / "checkpoint.pkl", BisimSAC("MlpPolicy", "Pendulum-v1", **LEARNING))
+    monkeypatch.undo()
+    with pytest.raises(ValueError, match=r"needs the versions that it was written with: .*torch 1\.0 there and 2"):
+        load_checkpoint(tmp_path / "checkpoint.pkl")
+
+
+def test_training_goes_on_although_a_logger_had_been_set(tmp_path: Path) -> None:
+    model = BisimSAC("MlpPolicy", "Pendulum-v1", **LEARNING)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(40, callback=Checkpoint(tmp_path / "checkpoint.pkl", 30))
+    assert load_checkpoint(tmp_path / "checkpoint.pkl")[0].learn(10, reset_num_timesteps=False).num_timesteps == 40

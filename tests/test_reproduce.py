@@ -118,7 +118,7 @@ def test_a_sweep_goes_on_from_where_it_was_killed_and_ends_with_the_same_numbers
 
 def test_a_finished_sweep_has_curves_a_csv_and_a_table_and_nothing_left_to_do(local) -> None:
     (folder,) = (local / "results").iterdir()
-    assert folder.name == "cartpole_400steps_every100_learning_starts=100_initial_gradient_steps=20_batch_size=32"
+    assert folder.name == "cartpole_400steps_every100_batch_size=32_initial_gradient_steps=20_learning_starts=100"
     assert (folder / "curves.png").read_bytes().startswith(b"\x89PNG")
     assert "mean_return,N_m=2,normed-IR-ID,3,400," in (folder / "curves.csv").read_text()
     assert "| N_m=2 | normed-IR-ID | 3 |" in (folder / "table.md").read_text()
@@ -127,7 +127,7 @@ def test_a_finished_sweep_has_curves_a_csv_and_a_table_and_nothing_left_to_do(lo
     assert process.stderr.startswith("6 of 6 runs have ended")
 
 
-def test_a_dry_run_shows_commands_that_the_command_line_accepts(tmp_path) -> None:
+def test_a_dry_run_shows_the_commands_and_the_time_and_runs_nothing(tmp_path) -> None:
     process = reproduce(tmp_path, *SWEEP, "--dry-run")
     commands = process.stdout.splitlines()
     assert len(commands) == 6
@@ -142,6 +142,9 @@ def test_a_dry_run_shows_commands_that_the_command_line_accepts(tmp_path) -> Non
         (("tetris",), "invalid choice: 'tetris'"),
         (("cartpole", "--methods", "DQN"), "--methods DQN: cartpole has SAC, DBC"),
         (("cartpole", "--panels", "N_m=9"), "--panels N_m=9: cartpole has N_m=0"),
+        (("cartpole", "--params", "batchsize:16"), "unknown key 'batchsize', did you mean 'batch_size'"),
+        (("cartpole", "--params", "batch_size=16"), "--params: unknown key 'batch_size=16'"),
+        (("cartpole", "--params", "batch_size"), "batch_size: write KEY:VALUE"),
         (("cartpole", "--seeds", "0"), "--seeds 0: must be at least 1"),
         (("cartpole", "--backend", "dask"), "--backend dask and --scheduler ADDRESS belong together"),
     ],

@@ -104,7 +104,7 @@ def draw(results: list[Result], figure: Figure, out: Path) -> None:
     for column in range(len(panels)):
         axes[-1, column].set_xlabel("environment steps")
     handles = {label: line for ax in axes.flat for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    picture.legend(handles.values(), handles, loc="outside lower center", ncols=min(len(handles), 4))
+    picture.legend(handles.values(), handles, loc="outside lower center", ncols=min(len(handles), 2 * len(panels)))
     with atomic_path(out / "curves.png") as temporary:
         picture.savefig(temporary, dpi=90, format="png")
     with atomic_path(out / "curves.csv") as temporary, temporary.open("w", newline="") as file:

@@ -119,11 +119,8 @@ def _draw_curve(ax: Axes, curve: Curve, label: str, color: str) -> None:
 
 def _label(ax: Axes, quantity: str, title: str, first: bool) -> None:
     _, _, label, scale = QUANTITIES[quantity]
-    ax.set(
-        title=title,
-        yscale=scale if ax.dataLim.y1 > 0 else "linear",  # nothing measured yet has no logarithm
-        ylabel=label if first else "",
-    )
+    decades = 0 < 10 * ax.dataLim.y0 < ax.dataLim.y1  # otherwise a logarithm has nothing to show
+    ax.set(title=title, yscale=scale if decades else "linear", ylabel=label if first else "")
     ax.grid(alpha=0.3)
 
 

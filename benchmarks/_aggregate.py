@@ -63,13 +63,15 @@ def median_curve(runs: list[Result], key: str) -> Curve:
     """Median and range: what grows without bound has no useful mean."""
     steps, values = series(runs, key)
     values = np.ma.masked_invalid(values)
-    return steps, np.ma.median(values, axis=0), values.min(axis=0), values.max(axis=0)
+    middle, low, high = np.ma.median(values, axis=0), values.min(axis=0), values.max(axis=0)
+    return steps, np.ma.filled(middle, np.nan), np.ma.filled(low, np.nan), np.ma.filled(high, np.nan)
 
 
 def ratio_curve(runs: list[Result], key: str) -> Curve:
     """Mean over the runs of mu_bd / mu_rd, where any reward has been found."""
     (steps, mu_bd), (_, mu_rd) = series(runs, "mu_bd"), series(runs, "mu_rd")
     middle = np.ma.mean(np.ma.masked_invalid(mu_bd) / np.ma.masked_less_equal(np.ma.masked_invalid(mu_rd), 0), axis=0)
+    middle = np.ma.filled(middle, np.nan)
     return steps, middle, middle, middle
 
 

@@ -192,12 +192,17 @@ def steps_of(result: dict[str, Any]) -> list[int]:
     return [evaluation["step"] for evaluation in result["evaluations"]]
 
 
+def run_folder(folder: Path) -> tuple[Path, dict[str, Any]]:
+    """Where the zoo has put a run, and the settings it was made with."""
+    (run,) = (folder / "bisim_sac").glob("*_1")
+    return run, yaml.unsafe_load(next(run.glob("*/config.yml")).read_text())
+
+
 def collect(folder: Path) -> dict[str, Any]:
     """What the zoo and TensorBoard have recorded of a run, evaluation by evaluation."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    (run,) = (folder / "bisim_sac").glob("*_1")
-    arguments = yaml.unsafe_load(next(run.glob("*/config.yml")).read_text())
+    run, arguments = run_folder(folder)
     with np.load(run / "evaluations.npz") as archive:
         steps, returns = archive["timesteps"], archive["results"]
     logged: dict[str, dict[int, float]] = {name: {} for name in LOGGED}
@@ -230,8 +235,7 @@ def play(folder: Path, identity: dict, split: str, n_episodes: int = 20) -> list
 
     from sb3_robust_bisim import BisimSAC
 
-    (run,) = (folder / "bisim_sac").glob("*_1")
-    arguments = yaml.unsafe_load(next(run.glob("*/config.yml")).read_text())
+    run, arguments = run_folder(folder)
     kwargs = {**arguments["env_kwargs"], "split": split}
     venv = VecFrameStack(make_vec_env(identity["env"], 1, seed=10_000, env_kwargs=kwargs), n_stack=3)
     model = BisimSAC.load(next(run.glob("robust_bisim-*.zip")), env=venv, buffer_size=1)

@@ -174,10 +174,13 @@ class BisimExperimentManager(ExperimentManager):
     def learn(self, model: BaseAlgorithm) -> None:
         if not self.resumed:
             return super().learn(model)
-        log_interval = {-1: 4}.get(self.log_interval, self.log_interval if self.log_interval >= 0 else None)
+        # the zoo's meaning: -1 is the default of the algorithm, anything below turns it off
+        log_interval = (
+            {} if self.log_interval == -1 else {"log_interval": self.log_interval if self.log_interval > -1 else None}
+        )
         try:
             rest = self.n_timesteps - model.num_timesteps
-            model.learn(rest, self.callbacks, log_interval, reset_num_timesteps=False)  # type: ignore[arg-type]
+            model.learn(rest, self.callbacks, reset_num_timesteps=False, **log_interval)  # type: ignore[arg-type]
         except KeyboardInterrupt:  # as in the zoo: what was learned is saved
             pass
         finally:

@@ -2,8 +2,8 @@
 What is compared: tasks, methods, seeds and steps, after the figures of the paper. The settings are those of zoo_configs/.
 
 At a scale that a small machine finishes: the paper runs 10 seeds (5 from pixels), 50,000 steps of cartpole, 100,000 of
-pendulum and mountain car, 500,000 of each of 16 environments from pixels. `dmc_state`, `bf16`, the method `self-prediction`
-and those with `clamp2` or `half` in their names are not in the paper.
+pendulum and mountain car, 500,000 of each of 16 environments from pixels. `dmc_state`, `bf16`, the methods `self-prediction`
+and `self-prediction-IR` and those with `clamp2` or `half` in their names are not in the paper.
 """
 
 from dataclasses import dataclass, field
@@ -76,6 +76,7 @@ FIGURES = {
         {
             **_variants("SAC", "DBC", "DBC-normed", "normed-IR", "normed-ID", "normed-IR-ID"),
             "self-prediction": Method(("self-prediction",), panels=("N_m=2", "N_m=3")),
+            "self-prediction-IR": Method(("self-prediction",), {"intrinsic_reward_scale": 2.0}, ("N_m=2", "N_m=3")),
         },
         *(5, 10_000, 500, 10, 17),
         rows=ALL_ROWS,

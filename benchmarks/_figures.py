@@ -44,6 +44,7 @@ class Figure:
     """
     :param rows: what is drawn over the steps, keys of ``_aggregate.QUANTITIES``
     :param seconds_per_1000_steps: of one run on one core, until finished runs tell better
+    :param eval_envs: side by side, worth it where episodes are long
     """
 
     panels: dict[str, Panel]
@@ -54,6 +55,7 @@ class Figure:
     eval_episodes: int
     seconds_per_1000_steps: float
     rows: tuple[str, ...] = ("mean_return", "embedding_norm_max")
+    eval_envs: int = 1
 
 
 def _variants(*names: str, **params: Any) -> dict[str, Method]:
@@ -84,8 +86,9 @@ FIGURES = {
     "mountain_car": Figure(
         _noisy(MOUNTAIN_CAR, 1, 2),
         {**_variants("SAC", "DBC-IR", "DBC-normed", "normed-IR", "normed-IR-ID"), **_CLAMPED_BEFORE_SCALING},
-        *(5, 20_000, 1000, 10, 20),
+        *(5, 20_000, 1000, 10, 17),
         rows=ALL_ROWS,
+        eval_envs=10,
     ),
     "pendulum": Figure(_noisy(PENDULUM, 10), _variants("SAC", "DBC", "normed-IR-ID"), *(3, 30_000, 1000, 10, 17)),
     "dbc_alt": Figure(_noisy(CARTPOLE, 0, 2), _variants("DBC", "DBC-alt"), *(5, 10_000, 500, 10, 17), rows=ALL_ROWS),

@@ -49,6 +49,7 @@ class Run:
     steps: int
     eval_freq: int
     eval_episodes: int
+    eval_envs: int
 
     @property
     def name(self) -> str:
@@ -56,9 +57,8 @@ class Run:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """What a result must agree with to be this run's, as JSON gives it back."""
+        """What a result must agree with to be this run's, as JSON gives it back; two figures may share a run."""
         identity = {
-            "figure": self.figure,
             "panel": self.panel_name,
             "method": self.method_name,
             "env": self.panel.env_id,
@@ -78,6 +78,7 @@ class Run:
             *("train", "--env", self.panel.env_id, "--variant", *self.method.variants, *self.panel.variants),
             *("--conf-file", str(CONFIG), "--seed", str(self.seed), "--n-timesteps", str(self.steps)),
             *("--eval-freq", str(self.eval_freq), "--eval-episodes", str(self.eval_episodes)),
+            *("--n-eval-envs", str(self.eval_envs)),
             *("--log-interval", "1", "--verbose", "0", "--num-threads", "1", "--log-folder", str(folder)),
             *("--tensorboard-log", str(folder / "tensorboard")),
             *("--checkpoint", str(folder / "checkpoint.pkl"), "--checkpoint-freq", str(self.eval_freq)),
@@ -103,8 +104,9 @@ def adjusted(name: str, args: argparse.Namespace) -> tuple[str, Figure]:
 
 def runs_of(name: str, figure: Figure, seeds: int) -> list[Run]:
     """All runs of a figure, seed by seed, so that an early look compares all methods."""
+    length = (figure.steps, figure.eval_freq, figure.eval_episodes, figure.eval_envs)
     return [
-        Run(name, panel_name, method_name, panel, method, seed, figure.steps, figure.eval_freq, figure.eval_episodes)
+        Run(name, panel_name, method_name, panel, method, seed, *length)
         for seed in range(seeds)
         for panel_name, panel in figure.panels.items()
         for method_name, method in figure.methods.items()
@@ -113,8 +115,9 @@ def runs_of(name: str, figure: Figure, seeds: int) -> list[Run]:
 
 
 def ended(runs: list[Run], out: Path) -> list[dict[str, Any]]:
-    """The results that are there."""
-    return [result for run in runs if (result := finished(out / run.figure / f"{run.name}.json", run.identity))]
+    """The results that are there, one for each run, whichever figure it was made for."""
+    found = ((finished(path, run.identity) for path in sorted(out.glob(f"*/{run.name}.json"))) for run in runs)
+    return [result for results in found if (result := next(filter(None, results), None))]
 
 
 # --- what a worker does; it reaches other machines by value, and imports only what is installed there

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -134,6 +135,19 @@ def test_a_dry_run_shows_the_commands_and_the_time_and_runs_nothing(tmp_path) ->
     assert not (tmp_path / "work").exists()
     assert "--variant SAC" in commands[0]
     assert "0 of 6 runs have ended; the rest takes" in process.stderr
+
+
+def test_a_run_that_two_figures_share_is_run_once(tmp_path) -> None:
+    recorded = sorted(ROOT.glob("benchmarks/results/cartpole/N_m2_DBC_seed*.json"))
+    (tmp_path / "results" / "cartpole").mkdir(parents=True)
+    for path in recorded:
+        shutil.copy(path, tmp_path / "results" / "cartpole")
+    assert len(recorded) >= 5
+    process = reproduce(tmp_path, "dbc_alt", "--panels", "N_m=2", "--dry-run")
+    assert process.stderr.startswith("5 of 10 runs have ended")
+    assert all("--variant DBC-alt" in command for command in process.stdout.splitlines())
+    assert reproduce(tmp_path, "dbc_alt", "--only-draw").returncode == 0
+    assert "| N_m=2 | DBC | 5 |" in (tmp_path / "results" / "dbc_alt" / "table.md").read_text()
 
 
 @pytest.mark.parametrize(

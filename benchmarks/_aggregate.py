@@ -186,8 +186,9 @@ def _ending(runs: list[Result], final: np.ndarray, full: np.ndarray | None) -> d
         pair = {"": (full[:, None], final[:, None])}
         better, interval = estimate(pair, metrics.probability_of_improvement, reps=REPS, random_state=generator)
         row["full_is_better"] = [_short(value) for value in (better[""], *np.ravel(interval[""]))]
-    for split in runs[0].get("final_return_by_split", {}):
-        row[f"final_return_{split}"] = [_short(np.mean(run["final_return_by_split"][split])) for run in runs]
+    played = [run["final_return_by_split"] for run in runs if "final_return_by_split" in run]  # those that did not break off
+    for split in played[0] if played else ():
+        row[f"final_return_{split}"] = [_short(np.mean(returns[split])) for returns in played]
     return row
 
 

@@ -161,6 +161,7 @@ def build(arm: Arm, observe: Observations, seed: int) -> BisimSAC:
         "MlpPolicy",
         Spaces(observe.space),
         seed=seed,
+        device="cpu",
         learning_rate=1e-3,
         buffer_size=1,
         c_r=C_R,

@@ -15,20 +15,22 @@ import shutil
 import sys
 import traceback
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # runs are spread over processes, one thread each
 
+import _machine
+import cloudpickle
 import joblib
 import numpy as np
 import yaml
 from _aggregate import draw, tables
 from _figures import FIGURES, Figure, Method, Panel
-from _machine import machine
 from tqdm import tqdm
 
-from sb3_robust_bisim.zoo import check_keys
+from sb3_robust_bisim.zoo import check_keys, variant_settings
 
 ROOT = Path(__file__).resolve().parent
 CONFIG = ROOT.parent / "zoo_configs" / "bisim_sac.yml"
@@ -72,7 +74,13 @@ class Run:
         }
         return json.loads(json.dumps(identity))
 
-    def command(self, folder: Path) -> list[str]:
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the configuration makes of it; a result keeps the same under "arguments"."""
+        settings = configured(self.panel.env_id, *self.method.variants, *self.panel.variants)
+        return json.loads(json.dumps(without_identity({**settings, **self.method.params})))
+
+    def command(self, folder: Path, device: str) -> list[str]:
         """What follows ``python -m sb3_robust_bisim``."""
         return [
             *("train", "--env", self.panel.env_id, "--variant", *self.method.variants, *self.panel.variants),
@@ -80,11 +88,21 @@ class Run:
             *("--eval-freq", str(self.eval_freq), "--eval-episodes", str(self.eval_episodes)),
             *("--n-eval-envs", str(self.eval_envs)),
             *("--log-interval", "1", "--verbose", "0", "--num-threads", "1", "--log-folder", str(folder)),
-            *("--tensorboard-log", str(folder / "tensorboard")),
+            *("--tensorboard-log", str(folder / "tensorboard"), "--device", device),
             *("--checkpoint", str(folder / "checkpoint.pkl"), "--checkpoint-freq", str(self.eval_freq)),
             *_store_dict("--env-kwargs", self.panel.env_kwargs),
             *_store_dict("-params", self.method.params),
         ]
+
+
+@cache
+def configured(env_id: str, *variants: str) -> dict[str, Any]:
+    return {**yaml.safe_load(CONFIG.read_text())[env_id], **variant_settings(CONFIG, env_id, *variants)}
+
+
+def without_identity(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings but those that a run's identity names."""
+    return {key: value for key, value in settings.items() if key not in ("env_kwargs", "variants", "n_timesteps")}
 
 
 def _store_dict(option: str, values: dict[str, Any]) -> list[str]:
@@ -129,7 +147,7 @@ def finished(path: Path, identity: dict[str, Any]) -> dict[str, Any] | None:
     return result if result.items() >= identity.items() else None
 
 
-def train(command: list[str], folder: Path, result_path: Path, identity: dict, measured: dict, splits: tuple) -> dict:
+def train(command: list[str], folder: Path, result_path: Path, identity: dict, commit: str, splits: tuple) -> dict:
     """One run, from its checkpoint if it has one, or its result if it has ended; what went wrong under "failed"."""
     from filelock import FileLock
 
@@ -138,7 +156,7 @@ def train(command: list[str], folder: Path, result_path: Path, identity: dict, m
         if result := finished(result_path, identity):
             return result
         try:
-            measured = begin(folder, measured)
+            measured = begin(folder, {**_machine.machine(), "commit": commit})
             stopped = learn(command, folder)
             result = {**identity, **measured, **stopped, **collect(folder)}
             if not stopped and steps_of(result)[-1] + identity["eval_freq"] <= identity["steps"]:
@@ -163,9 +181,10 @@ def begin(folder: Path, measured: dict) -> dict:
     """Clear away what cannot be gone on with, and say which code and machine the run is made with."""
     path = folder / "measured.json"
     if (folder / "checkpoint.pkl").exists() or (folder / "trained.json").exists():
-        begun = json.loads(path.read_text())["commit"] if path.exists() else "unknown"
-        if not begun.endswith(measured["commit"]):
-            measured = {**measured, "commit": f"{begun}, then {measured['commit']}"}
+        begun = json.loads(path.read_text()) if path.exists() else {}
+        for key in ("commit", "machine"):
+            if not (before := begun.get(key, "unknown")).endswith(measured[key]):
+                measured = {**measured, key: f"{before}, then {measured[key]}"}
     else:
         shutil.rmtree(folder)
     write(path, json.dumps(measured))
@@ -226,8 +245,7 @@ def collect(folder: Path) -> dict[str, Any]:
         if between["embedding_norm_max"]:
             means["embedding_norm_max"] = float(f"{max(between['embedding_norm_max']):.5g}")
         evaluations.append({"step": int(end), "returns": np.round(values, 3).tolist(), **means})
-    settings = {key: value for key, value in arguments.items() if key not in ("env_kwargs", "variants", "n_timesteps")}
-    return {"arguments": settings, "seconds": round(seconds), "evaluations": evaluations}
+    return {"arguments": without_identity(arguments), "seconds": round(seconds), "evaluations": evaluations}
 
 
 def play(folder: Path, identity: dict, split: str, n_episodes: int = 20) -> list[float]:
@@ -241,7 +259,7 @@ def play(folder: Path, identity: dict, split: str, n_episodes: int = 20) -> list
     run, arguments = run_folder(folder)
     kwargs = {**arguments["env_kwargs"], "split": split}
     venv = VecFrameStack(make_vec_env(identity["env"], 1, seed=10_000, env_kwargs=kwargs), n_stack=3)
-    model = BisimSAC.load(next(run.glob("robust_bisim-*.zip")), env=venv, buffer_size=1)
+    model = BisimSAC.load(next(run.glob("robust_bisim-*.zip")), env=venv, device="cpu", buffer_size=1)
     returns, _ = evaluate_policy(model, model.get_env(), n_episodes, return_episode_rewards=True)  # type: ignore[arg-type]
     venv.close()
     return np.round(returns, 3).tolist()
@@ -263,6 +281,7 @@ def seconds_left(todo: list[Run], results: list[dict], figure: Figure) -> float:
 
 def backend(args: argparse.Namespace) -> Any:
     if args.backend == "dask":
+        cloudpickle.register_pickle_by_value(_machine)  # the workers cannot import it
         return joblib.parallel_config(backend="dask", n_jobs=-1, scheduler_host=args.scheduler, wait_for_workers_timeout=60)
     return joblib.parallel_config(backend="loky", n_jobs=args.jobs)
 
@@ -270,13 +289,13 @@ def backend(args: argparse.Namespace) -> Any:
 def sweep(todo: list[Run], args: argparse.Namespace, out: Path, done: int) -> list[str]:
     """Do all runs; the names of those that failed."""
     failed: list[str] = []
-    measured = machine()  # the code that the workers load, whatever is committed while they run
+    commit = _machine.machine()["commit"]  # of the code that the workers load, whatever is committed while they run
     work, out = args.work.resolve(), out.resolve()
     tasks = [
         joblib.delayed(train)(
-            run.command(work / run.figure / run.name),
+            run.command(work / run.figure / run.name, args.device),
             *(work / run.figure / run.name, out / run.figure / f"{run.name}.json"),
-            *(run.identity, measured, run.panel.splits),
+            *(run.identity, commit, run.panel.splits),
         )
         for run in todo
     ]
@@ -291,16 +310,17 @@ def sweep(todo: list[Run], args: argparse.Namespace, out: Path, done: int) -> li
     return failed
 
 
-def check_alike(results: list[dict]) -> None:
-    """Curves must not mix runs from before and after a change of the configuration."""
-    first: dict[tuple[str, str], dict] = {}
-    for result in results:
-        other = first.setdefault((result["panel"], result["method"]), result)
-        if result["arguments"] != other["arguments"]:
-            sys.exit(
-                f"{result['panel']} {result['method']}: seeds {other['seed']} and {result['seed']} were run with different "
-                "settings, the configuration has changed in between. Move the older results away."
-            )
+def check_current(runs: list[Run], out: Path) -> None:
+    """A result from before a change of the configuration is not the run's, and must not be drawn beside later ones."""
+    for run in runs:
+        for result in ended([run], out):
+            here, there = run.settings, result["arguments"]
+            if differing := sorted(key for key in {*here, *there} if here.get(key) != there.get(key)):
+                pairs = ", ".join(f"{key} is {there.get(key)} there and {here.get(key)} in {CONFIG.name}" for key in differing)
+                sys.exit(
+                    f"{out}: the result of {run.panel_name} {run.method_name} seed {run.seed} is another one's: {pairs}. "
+                    "Move the older results away."
+                )
 
 
 def setting(text: str) -> tuple[str, Any]:
@@ -322,6 +342,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--panels", nargs="+", help="some of the tasks, N_m=2 for example (default: all)")
     parser.add_argument("--methods", nargs="+", help="some of the methods (default: all)")
     parser.add_argument("--jobs", type=int, default=joblib.cpu_count(), help="local processes (default: %(default)s)")
+    parser.add_argument("--device", default="cpu", help="of every run; on one GPU --jobs 1 or a few (default: %(default)s)")
     parser.add_argument("--backend", choices=("loky", "dask"), default="loky", help="local processes, or a Dask cluster")
     parser.add_argument("--scheduler", help="address of the Dask scheduler, host:port; its workers need --nthreads 1")
     parser.add_argument(
@@ -356,6 +377,7 @@ def main() -> None:
         for run in runs_of(name, figure, args.seeds or figure.seeds)
         if run.panel_name in (args.panels or figure.panels) and run.method_name in (args.methods or figure.methods)
     ]
+    check_current(runs, out)
     todo = [run for run in runs if not ended([run], out)]
     done = ended(runs, out)
     minutes = seconds_left(todo, done, figure) / 60
@@ -364,16 +386,17 @@ def main() -> None:
     print(f"{len(done)} of {len(runs)} runs have ended; {left}.", file=sys.stderr)
     if args.dry_run:
         for run in todo:
-            command = run.command(args.work / run.figure / run.name)
+            command = run.command(args.work / run.figure / run.name, args.device)
             print(shlex.join(["python", "-m", "sb3_robust_bisim", *command]).replace(f"{Path.cwd()}/", ""))
         return
     failed = []
     if todo and not args.only_draw:
         failed = sweep(todo, args, out, sum(result["steps"] for result in done))
-    done = ended(runs_of(name, figure, max(MOST_SEEDS, args.seeds or 0)), out)  # also what earlier sweeps have left
+    every = runs_of(name, figure, max(MOST_SEEDS, args.seeds or 0))  # also what earlier sweeps have left
+    check_current(every, out)
+    done = ended(every, out)
     if not done:
         sys.exit("No run has ended yet.")
-    check_alike(done)
     draw(done, figure, out / name)
     summary = tables(done, figure, out / name)
     print(json.dumps({"benchmark": "reproduce", "figure": name, "runs": len(done), "failed": failed, **summary}))

@@ -39,6 +39,7 @@ from sb3_robust_bisim.encoders import MlpEncoder, PixelEncoder
 BATCH = {"mlp": 512, "cnn": 128}
 SCHEDULE = {"paper": dict(policy_delay=2, target_update_interval=2), "sac": dict(policy_delay=1)}
 FULL = dict(intrinsic_reward_scale=2.0, inverse_dynamics_coef=1.0)
+CPU = dict(device="cpu", seed=0)  # as the floor
 OFF = dict(bisim_coef=0.0, norm_constraint=False)
 CARTPOLE = "robust_bisim/SparseCartPole-v0"
 PIXELS = "robust_bisim/cheetah-run-pixels-v0"
@@ -63,7 +64,7 @@ def build(kind: str, arm: str, schedule: str, bf16: bool) -> BaseAlgorithm:
     """A model with a filled buffer whose next call is `train`."""
     env = gym.make(CARTPOLE, noise_multiplier=1) if kind == "mlp" else RandomPixels()
     encoder = MlpEncoder if kind == "mlp" else PixelEncoder
-    common = dict(seed=0, buffer_size=1000, learning_starts=10**9, learning_rate=1e-3)
+    common = dict(**CPU, buffer_size=1000, learning_starts=10**9, learning_rate=1e-3)
     policy = "MlpPolicy" if kind == "mlp" else "CnnPolicy"
     policy_kwargs = dict(
         net_arch=[256, 256], features_extractor_class=encoder, features_extractor_kwargs=dict(features_dim=50)
@@ -210,7 +211,7 @@ def bonus_cost(env_id: str, n_envs: int, steps: int, bf16: bool = False) -> dict
     env_kwargs = dict(distractor="none", shadows=False) if pixels else dict(noise_multiplier=2)
     venv = make_vec_env(env_id, n_envs, env_kwargs=env_kwargs, seed=0)
     bonus_env = IntrinsicRewardVecEnv(VecFrameStack(venv, 3) if pixels else venv)
-    model = BisimSAC("CnnPolicy" if pixels else "MlpPolicy", bonus_env, seed=0, buffer_size=n_envs, bf16=bf16, **FULL)
+    model = BisimSAC("CnnPolicy" if pixels else "MlpPolicy", bonus_env, **FULL, **CPU, buffer_size=n_envs, bf16=bf16)
     model.learn(n_envs)
     model.policy.set_training_mode(False)  # as collect_rollouts does, once before its steps
     times: dict[str, list[float]] = {"without_ms": [], "with_ms": [], "after_update_ms": []}
@@ -232,7 +233,7 @@ def bonus_cost(env_id: str, n_envs: int, steps: int, bf16: bool = False) -> dict
 
 def learn_cost(steps: int) -> dict[str, float]:
     """Time of a step of `learn()` on noisy cartpole over the time of its update."""
-    settings = dict(seed=0, buffer_size=50_000, batch_size=512, learning_starts=1000, learning_rate=1e-3)
+    settings = dict(**CPU, buffer_size=50_000, batch_size=512, learning_starts=1000, learning_rate=1e-3)
     model = BisimSAC("MlpPolicy", gym.make(CARTPOLE, noise_multiplier=2), **FULL, **SCHEDULE["paper"], **settings)
     model.learn(1000)
     updates: list[float] = []
@@ -256,7 +257,8 @@ def main() -> None:
     parser.add_argument("--cnn-rounds", type=int, default=10, help="the same for cnn; 0 leaves it out (default: %(default)s)")
     args = parser.parse_args()
     th.set_num_threads(1)
-    result: dict = {"benchmark": "update_cost", **machine(), "batch": BATCH}
+    allocator = {key: value for key, value in os.environ.items() if key.startswith("MALLOC_")}
+    result: dict = {"benchmark": "update_cost", **machine(), "allocator": allocator, "batch": BATCH}
     result["mlp"] = update_times("mlp", args.rounds, per_round=4)
     if args.cnn_rounds:
         result["cnn"] = update_times("cnn", args.cnn_rounds, per_round=2)

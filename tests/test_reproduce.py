@@ -134,6 +134,7 @@ def test_a_dry_run_shows_the_commands_and_the_time_and_runs_nothing(tmp_path) ->
     assert len(commands) == 6
     assert not (tmp_path / "work").exists()
     assert "--variant SAC" in commands[0]
+    assert "--device cpu" in commands[0]
     assert "0 of 6 runs have ended; the rest takes" in process.stderr
 
 
@@ -148,6 +149,31 @@ def test_a_run_that_two_figures_share_is_run_once(tmp_path) -> None:
     assert all("--variant DBC-alt" in command for command in process.stdout.splitlines())
     assert reproduce(tmp_path, "dbc_alt", "--only-draw").returncode == 0
     assert "| N_m=2 | DBC | 5 |" in (tmp_path / "results" / "dbc_alt" / "table.md").read_text()
+
+
+def test_results_of_another_configuration_are_refused(tmp_path) -> None:
+    recorded = json.loads((ROOT / "benchmarks/results/cartpole/N_m2_SAC_seed0.json").read_text())
+    recorded["arguments"]["batch_size"] = 64
+    (tmp_path / "results" / "cartpole").mkdir(parents=True)
+    (tmp_path / "results" / "cartpole" / "N_m2_SAC_seed0.json").write_text(json.dumps(recorded))
+    process = reproduce(tmp_path, "cartpole")
+    assert process.returncode == 1
+    assert "N_m=2 SAC seed 0 is another one's: batch_size is 64 there and 512 in bisim_sac.yml" in process.stderr
+    assert not (tmp_path / "work").exists()
+
+
+def test_a_run_that_broke_off_does_not_hide_the_others(tmp_path) -> None:
+    shutil.copytree(ROOT / "benchmarks/results/dmc_pixels", tmp_path / "results/dmc_pixels")
+    path = tmp_path / "results/dmc_pixels/video_SAC_seed0.json"
+    recorded = json.loads(path.read_text())
+    held_out = recorded.pop("final_return_by_split")["eval"]
+    path.write_text(json.dumps({**recorded, "stopped": "train/critic_loss became nan"}))
+    process = reproduce(tmp_path, "dmc_pixels", "--only-draw")
+    assert process.returncode == 0, process.stderr
+    row = json.loads(process.stdout.splitlines()[-1])["panels"]["video"]["SAC"]
+    assert (row["runs"], row["stopped"], len(row["final_return_eval"])) == (2, 1, 1)
+    assert sum(held_out) / 20 != pytest.approx(row["final_return_eval"][0], rel=1e-3)
+    assert "Broke off" in (tmp_path / "results/dmc_pixels/table.md").read_text()
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import platform
 import random
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import cloudpickle
 import numpy as np
@@ -71,14 +71,16 @@ def save_checkpoint(path: str | Path, model: BaseAlgorithm, context: Any = None,
     :param about: plain values for :func:`read_about`
     """
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        pickle.dump({**(about or {}), "num_timesteps": model.num_timesteps, "versions": _versions()}, file)
-        _Pickler(file).dump((model, context, _generator_states()))
+        gpus = th.cuda.device_count() if model.device.type == "cuda" else 0
+        header = {"num_timesteps": model.num_timesteps, "versions": _versions(), "gpus": gpus}
+        pickle.dump({**(about or {}), **header}, file)
+        _Pickler(file).dump((model, context, _generator_states(model.device)))
 
 
 def read_about(path: str | Path) -> dict[str, Any]:
     """What was said about a checkpoint when it was written, its ``"num_timesteps"`` and the packages' ``"versions"``."""
     with Path(path).open("rb") as file:
-        return pickle.load(file)
+        return _read_header(file)
 
 
 def load_checkpoint(path: str | Path) -> tuple[Any, Any]:
@@ -90,13 +92,18 @@ def load_checkpoint(path: str | Path) -> tuple[Any, Any]:
 
     :param path: what :func:`save_checkpoint` wrote
     :return: the model with its environments and its replay buffer, and the context
-    :raises ValueError: if it was written with other versions of the packages
+    :raises ValueError: if it is no checkpoint, or was written with other versions of the packages or on a device that is
+        not here
     """
     with Path(path).open("rb") as file:
-        there, here = pickle.load(file)["versions"], _versions()
+        about = _read_header(file)
+        there, here = about["versions"], _versions()
         if there != here:
-            changes = ", ".join(f"{name} {there.get(name)} there and {here[name]} here" for name in here)
+            differing = (name for name in here if there.get(name) != here[name])
+            changes = ", ".join(f"{name} {there.get(name)} there and {here[name]} here" for name in differing)
             raise ValueError(f"{path}: a checkpoint needs the versions that it was written with: {changes}.")
+        if about["gpus"] > th.cuda.device_count():
+            raise ValueError(f"{path}: written with {about['gpus']} GPUs, here are {th.cuda.device_count()}; go on there.")
         model, context, (python, numpy, torch, cuda) = cloudpickle.load(file)
     model._custom_logger = False  # so that learn() makes one
     random.setstate(python)
@@ -107,13 +114,23 @@ def load_checkpoint(path: str | Path) -> tuple[Any, Any]:
     return model, context
 
 
+def _read_header(file: BinaryIO) -> dict[str, Any]:
+    try:
+        about = pickle.load(file)
+    except Exception as error:  # unpickling what is no pickle may raise anything
+        raise ValueError(f"{file.name}: this is no checkpoint. Name another file.") from error
+    if not isinstance(about, dict) or not about.keys() >= {"num_timesteps", "versions", "gpus"}:
+        raise ValueError(f"{file.name}: this is no checkpoint, but some other pickle. Name another file.")
+    return about
+
+
 def _versions() -> dict[str, str]:
     packages = ("torch", "numpy", "stable_baselines3", "gymnasium", "sb3_robust_bisim")
     return {"python": platform.python_version(), **{package: version(package) for package in packages}}
 
 
-def _generator_states() -> tuple[Any, ...]:
-    cuda = th.cuda.get_rng_state_all() if th.cuda.is_available() else []
+def _generator_states(device: th.device) -> tuple[Any, ...]:
+    cuda = th.cuda.get_rng_state_all() if device.type == "cuda" else []
     return random.getstate(), np.random.get_state(), th.get_rng_state(), cuda  # noqa: NPY002
 
 

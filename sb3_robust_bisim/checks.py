@@ -2,6 +2,7 @@
 
 import difflib
 import inspect
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -98,6 +99,10 @@ def check_names(algorithm: type, kwargs: dict[str, Any]) -> None:
     known = [*inspect.signature(algorithm).parameters, *inspect.signature(SAC).parameters]
     for name in kwargs:
         if name not in known:
-            matches = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean {matches[0]!r}?" if matches else "see the documentation of BisimSAC and SAC."
-            raise TypeError(f"BisimSAC has no argument {name!r} (value {kwargs[name]!r}): {hint}")
+            raise TypeError(f"BisimSAC has no argument {name!r} (value {kwargs[name]!r}){closest(name, known)}")
+
+
+def closest(name: str, known: Iterable[str]) -> str:
+    """The end of a message about a name that is not known."""
+    matches = difflib.get_close_matches(name, known, n=1)
+    return f", did you mean {matches[0]!r}?" if matches else ": see the documentation of BisimSAC and SAC."

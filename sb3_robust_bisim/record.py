@@ -33,8 +33,9 @@ def record(model: BaseAlgorithm, venv: VecEnv, folder: Path) -> tuple[Path, Path
         action, _ = model.predict(obs, deterministic=True)  # type: ignore[arg-type]
         obs, _, dones, _ = venv.step(action)
         done = bool(dones[0])
+    fps = venv.get_attr("metadata")[0].get("render_fps", 25)  # as fast as the task is
     with atomic_path(folder / "agent.mp4") as temporary:
-        imageio.mimwrite(temporary, shown, format="FFMPEG", fps=25, macro_block_size=2)  # type: ignore[arg-type]
+        imageio.mimwrite(temporary, shown, format="FFMPEG", fps=fps, macro_block_size=2)  # type: ignore[arg-type]
     with atomic_path(folder / "what_the_agent_sees.png") as temporary:
         Image.fromarray(contact_sheet(seen)).save(temporary)
     return folder / "agent.mp4", folder / "what_the_agent_sees.png"

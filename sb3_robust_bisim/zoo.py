@@ -1,7 +1,6 @@
 """The rl-zoo command line with BisimSAC known to it: training, resuming, tuning, playing and plotting are the zoo's."""
 
 import argparse
-import difflib
 import inspect
 import sys
 from contextlib import closing
@@ -26,17 +25,16 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from sb3_robust_bisim.atomic import atomic_path
 from sb3_robust_bisim.bisim_sac import BisimSAC
 from sb3_robust_bisim.checkpoint import Checkpoint, load_checkpoint, read_about
+from sb3_robust_bisim.checks import closest
 
 ALGO = "bisim_sac"
 DEFAULT_CONFIG = Path("zoo_configs/bisim_sac.yml")
-# What an entry of a zoo YAML may hold beside the arguments of the algorithm
 WEIGHTS = (("bisim_coef", 0.05, 5.0), ("intrinsic_reward_scale", 0.01, 20.0), ("inverse_dynamics_coef", 0.01, 20.0))
+# What an entry of a zoo YAML may hold beside the arguments of the algorithm
 ZOO_KEYS = (
     *("callback", "env_kwargs", "env_wrapper", "eval_env_kwargs", "frame_stack", "monitor_kwargs", "n_envs"),
     *("n_timesteps", "noise_std", "noise_type", "normalize", "policy", "variants", "vec_env_wrapper"),
 )
-
-
 PASSED_BY_THE_ZOO = {"kwargs", "env", "seed", "verbose", "device", "tensorboard_log", "_init_setup_model"}
 
 
@@ -48,7 +46,7 @@ def sample_bisim_sac_params(
     # SAC's sampler replaces all of policy_kwargs
     sampled["policy_kwargs"] = {**BisimExperimentManager.tuned.get("policy_kwargs", {}), **sampled["policy_kwargs"]}
     for name, low, high in WEIGHTS:
-        if BisimExperimentManager.tuned.get(name, 1.0) > 0:
+        if BisimExperimentManager.tuned.get(name, inspect.signature(BisimSAC).parameters[name].default) > 0:
             sampled[name] = trial.suggest_float(name, low, high, log=True)
     return {**sampled, "policy_delay": trial.suggest_int("policy_delay", 1, 2)}
 
@@ -90,8 +88,7 @@ def check_keys(hyperparams: dict[str, Any], source: str) -> None:
     known = {*ZOO_KEYS, *inspect.signature(BisimSAC).parameters, *inspect.signature(SAC).parameters} - PASSED_BY_THE_ZOO
     for key in hyperparams:
         if key not in known:
-            hint = difflib.get_close_matches(key, known, n=1)
-            raise ValueError(f"{source}: unknown key {key!r}" + (f", did you mean {hint[0]!r}?" if hint else "."))
+            raise ValueError(f"{source}: unknown key {key!r}{closest(key, known)}")
 
 
 class BisimExperimentManager(ExperimentManager):
@@ -108,14 +105,20 @@ class BisimExperimentManager(ExperimentManager):
     resumed = False
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        params = self.custom_hyperparams or {}
+        if self.algo == ALGO:
+            check_keys(params, "-params")
         if self.continue_training and not self.variants:
-            # the variant that the agent was trained as: `load` takes the entry's settings in place of the saved ones
+            # what the agent was trained with: `load` takes the entry's settings in place of the saved ones
             arguments = Path(self.trained_agent).parent / self.env_name / "args.yml"
             if arguments.is_file():
-                BisimExperimentManager.variants = yaml.unsafe_load(arguments.read_text()).get("variant", [])
-        if self.variants:  # the command line's own -params win
-            settings = variant_settings(self.config, self.env_name.gym_id, *self.variants)
-            self.custom_hyperparams = {**settings, **(self.custom_hyperparams or {})}
+                trained = yaml.unsafe_load(arguments.read_text())
+                BisimExperimentManager.variants = trained.get("variant", [])
+                params = {**(trained.get("hyperparams") or {}), **params}
+                self.args.hyperparams = params  # kept in the run's args.yml, for the next time
+        # entry < variants < Optuna's trial < -params
+        settings = variant_settings(self.config, self.env_name.gym_id, *self.variants) if self.variants else {}
+        self.custom_hyperparams = {**settings, **self._trial_settings(settings), **params}
         hyperparams, saved_hyperparams = super().read_hyperparameters()
         if self.algo == ALGO:
             check_keys(hyperparams, self.config)
@@ -130,6 +133,15 @@ class BisimExperimentManager(ExperimentManager):
         BisimExperimentManager.tuned = dict(hyperparams)
         self.eval_env_kwargs = {**env_kwargs, **eval_kwargs, **(self._eval_env_kwargs_args or {})}
         return hyperparams, saved_hyperparams
+
+    def _trial_settings(self, settings: dict[str, Any]) -> dict[str, Any]:
+        """What Optuna found, if a trial was asked for, over the policy_kwargs that it was found with."""
+        if self.algo != ALGO or not (self.storage and self.study_name and self.trial_id):
+            return {}
+        found = self.load_trial(self.storage, self.study_name, self.trial_id)
+        entry = yaml.safe_load(Path(self.config).read_text()).get(self.env_name.gym_id, {})
+        policy_kwargs = {**entry, **settings}.get("policy_kwargs", {})
+        return {**found, "policy_kwargs": {**policy_kwargs, **found["policy_kwargs"]}}
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         if self.checkpoint is None:
@@ -147,7 +159,8 @@ class BisimExperimentManager(ExperimentManager):
 
     def _settings(self, hyperparams: dict[str, Any]) -> dict[str, Any]:
         """What must be the same for a run to be continued; it may become longer."""
-        asked = {key: vars(self.args)[key] for key in ("eval_freq", "eval_episodes", "save_freq", "eval_env_kwargs")}
+        keys = ("eval_freq", "eval_episodes", "n_eval_envs", "save_freq", "eval_env_kwargs", "device")
+        asked = {key: vars(self.args)[key] for key in keys}
         env_kwargs = {"env_kwargs": self.env_kwargs or hyperparams.get("env_kwargs", {})}
         seed = self.seed if self.seed_given else "random"  # the zoo draws one
         return {"env": str(self.env_name), "seed": seed, **hyperparams, **env_kwargs, **asked, "n_timesteps": None}
@@ -155,6 +168,8 @@ class BisimExperimentManager(ExperimentManager):
     def _continue(self, checkpoint: Path) -> tuple[BaseAlgorithm, dict[str, Any]]:
         hyperparams, saved_hyperparams = self.read_hyperparameters()
         about = read_about(checkpoint)
+        if "settings" not in about:
+            raise ValueError(f"--checkpoint {checkpoint}: not written by this command but in Python; go on with it there.")
         here, there = self._settings(saved_hyperparams), about["settings"]
         if differing := sorted(key for key in {*here, *there} if here.get(key) != there.get(key)):
             pairs = ", ".join(f"{key} is {there.get(key)} there and {here.get(key)} here" for key in differing)
@@ -189,17 +204,23 @@ class BisimExperimentManager(ExperimentManager):
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         super().save_trained_model(model)
         title = f"{self.env_name} {' '.join(self.variants) or self.algo}"
+        if self.checkpoint is not None and model.num_timesteps >= self.n_timesteps:
+            self.checkpoint.unlink(missing_ok=True)  # nothing is left to go on with
         report(Path(self.save_path), title, -1 if self.continue_training else getattr(model, "learning_starts", -1))
         if self.algo == ALGO and is_image_space(model.observation_space):
-            from sb3_robust_bisim.record import record  # needs the packages of the pixel tasks
-
-            with closing(self._seen_by_the_agent()) as venv:
-                print("Agent at work: ", *record(model, venv, Path(self.save_path)))
+            self._record(model)
         print(f"Model:          {self.save_path}/{self.env_name}.zip")
         if self.tensorboard_log:
             print(f"TensorBoard:    tensorboard --logdir {self.tensorboard_log}")
-        if self.checkpoint is not None and model.num_timesteps >= self.n_timesteps:
-            self.checkpoint.unlink(missing_ok=True)  # nothing is left to go on with
+
+    def _record(self, model: BaseAlgorithm) -> None:
+        try:
+            from sb3_robust_bisim.record import record
+        except ImportError as error:
+            print(f"Agent at work:  not shown, {error.name} is missing: pip install sb3_robust_bisim[dmc]")
+            return
+        with closing(self._seen_by_the_agent()) as venv:
+            print("Agent at work: ", *record(model, venv, Path(self.save_path)))
 
     def _seen_by_the_agent(self) -> VecEnv:
         """The evaluation environment, drawing what it shows."""
@@ -308,7 +329,7 @@ def _train_arguments(arguments: list[str]) -> list[str]:
     ours, theirs = parser.parse_known_args(arguments)
     BisimExperimentManager.variants = ours.variants
     BisimExperimentManager.checkpoint, BisimExperimentManager.checkpoint_freq = ours.checkpoint, ours.checkpoint_freq
-    BisimExperimentManager.seed_given = ours.seed is not None
+    BisimExperimentManager.seed_given = ours.seed is not None and ours.seed >= 0
     if ours.checkpoint_freq < 1:
         parser.error(f"--checkpoint-freq {ours.checkpoint_freq}: at least one step must lie between two checkpoints.")
     if ours.checkpoint is not None and {"-optimize", "--optimize-hyperparameters"} & set(arguments):

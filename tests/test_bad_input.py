@@ -85,7 +85,7 @@ def test_the_same_settings_are_taken_where_they_have_one() -> None:
     [("bisim_coeff", "bisim_coef"), ("intrinsic_reward", "intrinsic_reward_max"), ("learning_start", "learning_starts")],
 )
 def test_a_misspelt_argument_is_refused_with_the_right_one(wrong: str, right: str) -> None:
-    with pytest.raises(TypeError, match=rf"no argument '{wrong}' \(value 3\): did you mean '{right}'\?"):
+    with pytest.raises(TypeError, match=rf"no argument '{wrong}' \(value 3\), did you mean '{right}'\?"):
         make_model(**{wrong: 3})
 
 

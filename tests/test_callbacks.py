@@ -216,6 +216,11 @@ def test_a_zoo_yaml_can_name_them(tmp_path: Path) -> None:
             gym.make(NOISY),
             r"env_kwargs=\{'noise_multiplier': 1\}",
         ),
+        (
+            DenoisingFactorCallback(),
+            VecFrameStack(make_vec_env(NOISY, env_kwargs=dict(noise_multiplier=1)), 2),
+            r"shape \(16,\), where NoiseObservation gives \(8,\)",
+        ),
         (ValueBoundCallback(), DummyVecEnv([lambda: NoiseObservation(Wave(), 1)]), "pass env_id"),
         (ValueBoundCallback(env_id="Pendulum-v1"), None, "Pendulum-v1"),
     ],

@@ -1,5 +1,6 @@
 """Training that goes on from a checkpoint ends exactly as training that was never interrupted."""
 
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecFrameStack, VecNormalize
 
 from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer, IntrinsicRewardVecEnv, zoo
-from sb3_robust_bisim.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from sb3_robust_bisim.checkpoint import Checkpoint, load_checkpoint, read_about, save_checkpoint
 
 STEPS = 120
 LEARNING = {**SMALL, "learning_starts": 20, "buffer_size": 200}
@@ -136,6 +137,29 @@ def test_a_checkpoint_of_other_versions_is_refused(tmp_path: Path, monkeypatch: 
     monkeypatch.undo()
     with pytest.raises(ValueError, match=r"needs the versions that it was written with: .*torch 1\.0 there and 2"):
         load_checkpoint(tmp_path / "checkpoint.pkl")
+
+
+def test_a_checkpoint_of_a_gpu_that_is_not_here_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save_checkpoint(tmp_path / "checkpoint.pkl", BisimSAC("MlpPolicy", "Pendulum-v1", **LEARNING), about={"name": "a"})
+    assert read_about(tmp_path / "checkpoint.pkl")["gpus"] == 0
+    with (tmp_path / "checkpoint.pkl").open("rb") as file:
+        header, rest = pickle.load(file), file.read()
+    (tmp_path / "elsewhere.pkl").write_bytes(pickle.dumps({**header, "gpus": 99}) + rest)
+    with pytest.raises(ValueError, match=r"elsewhere\.pkl: written with 99 GPUs, here are \d"):
+        load_checkpoint(tmp_path / "elsewhere.pkl")
+
+
+def test_another_file_is_refused_by_name(command: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.pkl"
+    path.write_bytes(b"PK\x03\x04 a model, say")
+    with pytest.raises(ValueError, match=r"checkpoint\.pkl: this is no checkpoint. Name another file"):
+        zoo.main([*command, "--seed", "3"])
+    path.write_bytes(pickle.dumps([1, 2]))
+    with pytest.raises(ValueError, match=r"checkpoint\.pkl: this is no checkpoint, but some other pickle"):
+        zoo.main([*command, "--seed", "3"])
+    save_checkpoint(path, BisimSAC("MlpPolicy", "Pendulum-v1", **LEARNING))
+    with pytest.raises(ValueError, match=r"--checkpoint .*checkpoint\.pkl: not written by this command"):
+        zoo.main([*command, "--seed", "3"])
 
 
 def test_training_goes_on_although_a_logger_had_been_set(tmp_path: Path) -> None:

@@ -75,11 +75,14 @@ def test_the_config_files_hold_known_keys_and_the_papers_numbers(env_id: str) ->
     paper = {CARTPOLE: (2, 1, 50_000), PENDULUM: (0.1, 0.1, 100_000), MOUNTAIN_CAR: (20, 20, 100_000)}[env_id]
     assert (entry["intrinsic_reward_scale"], entry["inverse_dynamics_coef"], entry["n_timesteps"]) == paper
     assert (entry["batch_size"], entry["buffer_size"], entry["learning_rate"]) == (512, 50_000, 1e-3)
+    # the published code's reading of the clamp, 0.1 before scaling, where it decides
+    assert entry.get("intrinsic_reward_max", 0.1) == (2.0 if env_id == MOUNTAIN_CAR else 0.1)
 
 
 def test_train_evaluates_in_the_standard_task_and_reports_and_resumes_and_plays(zoo: Zoo, tmp_path: Path) -> None:
     common = ["--seed", "1", "--eval-freq", "40", "--eval-episodes", "2", "-f", str(tmp_path)]
-    output = zoo("train", "--env", CARTPOLE, "--variant", "normed-ID", *common, "-tb", str(tmp_path / "tb"), *SHORT)
+    own = ["--variant", "normed-ID", "-tb", str(tmp_path / "tb"), *SHORT, "inverse_dynamics_coef:0.3"]
+    output = zoo("train", "--env", CARTPOLE, *common, *own)
     run = tmp_path / "bisim_sac" / "robust_bisim-SparseCartPole-v0_1"
     evaluations = np.load(run / "evaluations.npz")
     assert evaluations["timesteps"].tolist() == [40, 80, 120]
@@ -91,7 +94,7 @@ def test_train_evaluates_in_the_standard_task_and_reports_and_resumes_and_plays(
     folder = run / "robust_bisim-SparseCartPole-v0"
     assert yaml.unsafe_load((folder / "args.yml").read_text())["variant"] == ["normed-ID"]
     model = BisimSAC.load(run / "robust_bisim-SparseCartPole-v0.zip")
-    assert (model.intrinsic_reward_scale, model.inverse_dynamics_coef, model.batch_size) == (0.0, 1.0, 16)
+    assert (model.intrinsic_reward_scale, model.inverse_dynamics_coef, model.batch_size) == (0.0, 0.3, 16)
     assert model.observation_space.shape == (12,)  # noise_multiplier: 2 from the config
     assert list((tmp_path / "tb").rglob("events.out.tfevents*"))
 
@@ -100,7 +103,9 @@ def test_train_evaluates_in_the_standard_task_and_reports_and_resumes_and_plays(
     assert "at first (step 40)" in resumed  # it had learned before
     second = tmp_path / "bisim_sac" / "robust_bisim-SparseCartPole-v0_2"
     model = BisimSAC.load(second / "robust_bisim-SparseCartPole-v0.zip")
-    assert (model.intrinsic_reward_scale, model.inverse_dynamics_coef) == (0.0, 1.0)  # still normed-ID
+    assert (model.intrinsic_reward_scale, model.inverse_dynamics_coef) == (0.0, 0.3)  # still normed-ID, with its -params
+    arguments = yaml.unsafe_load((second / "robust_bisim-SparseCartPole-v0" / "args.yml").read_text())
+    assert arguments["hyperparams"]["inverse_dynamics_coef"] == 0.3  # and so would a third one
     played = zoo("enjoy", "--env", CARTPOLE, "-f", str(tmp_path), "--exp-id", "1", "-n", "30", "--no-render")
     assert "Episode Reward" in played or "Loading" in played
 
@@ -127,6 +132,7 @@ def test_training_from_pixels_ends_with_a_video_and_what_the_agent_sees(zoo: Zoo
     assert str(run / "agent.mp4") in output
     video = imageio.get_reader(run / "agent.mp4")
     assert video.count_frames() == 20
+    assert video.get_meta_data()["fps"] == 2.0  # 50 control steps of 10 ms per frame
     frame = video.get_data(10)
     assert frame.shape == (256, 256, 3)
     assert frame.std() > 20  # there is something to be seen
@@ -135,6 +141,21 @@ def test_training_from_pixels_ends_with_a_video_and_what_the_agent_sees(zoo: Zoo
     assert model.bf16
     assert model.replay_buffer_class is FrameStackReplayBuffer
     assert model.observation_space.shape == (9, 84, 84)
+
+
+def test_training_from_pixels_ends_well_without_the_packages_for_video(
+    zoo: Zoo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("dm_control")
+    monkeypatch.delitem(sys.modules, "sb3_robust_bisim.record", raising=False)
+    monkeypatch.setitem(sys.modules, "imageio.v2", None)
+    output = zoo(
+        *("train", "--env", "robust_bisim/cartpole-swingup-pixels-v0", "-n", "20", "--eval-freq", "-1"),
+        *("--env-kwargs", "distractor:'color'", "action_repeat:50", "-f", str(tmp_path)),
+        *("-params", "learning_starts:20", "buffer_size:60", "n_envs:1"),
+    )
+    assert "imageio.v2 is missing: pip install sb3_robust_bisim[dmc]" in output
+    assert "Model:          " in output
 
 
 def test_env_kwargs_of_the_command_line_reach_training_and_evaluation(zoo: Zoo, tmp_path: Path) -> None:
@@ -152,7 +173,7 @@ def test_env_kwargs_of_the_command_line_reach_training_and_evaluation(zoo: Zoo, 
     ("arguments", "message"),
     [
         (["--variant", "normed-ir"], "--variant normed-ir: .* has SAC, DBC"),
-        (["-params", "bisim_coeff:1"], "unknown key 'bisim_coeff', did you mean 'bisim_coef'"),
+        (["-params", "bisim_coeff:1"], "-params: unknown key 'bisim_coeff', did you mean 'bisim_coef'"),
     ],
 )
 def test_bad_input_is_refused_before_a_run_folder_exists(zoo: Zoo, arguments: list[str], message: str, tmp_path: Path) -> None:
@@ -178,9 +199,14 @@ def test_a_misspelt_key_in_a_config_file_is_named(zoo: Zoo, tmp_path: Path) -> N
     assert not (tmp_path / "logs").exists()
 
 
-def test_optuna_samples_arguments_that_bisim_sac_takes() -> None:
+NO_HER = {"using_her_replay_buffer": False, "her_kwargs": {}}
+
+
+def test_optuna_samples_arguments_that_bisim_sac_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(BisimExperimentManager, "tuned", {"intrinsic_reward_scale": 2.0, "inverse_dynamics_coef": 1.0})
+
     def objective(trial: optuna.Trial) -> float:
-        sampled = sample_bisim_sac_params(trial, 1, 1, {"using_her_replay_buffer": False, "her_kwargs": {}})
+        sampled = sample_bisim_sac_params(trial, 1, 1, NO_HER)
         model = BisimSAC("MlpPolicy", CARTPOLE, buffer_size=100, **sampled)
         assert model.intrinsic_reward_scale == trial.params["intrinsic_reward_scale"]
         assert HYPERPARAMS_CONVERTER["bisim_sac"](trial.params) == sampled
@@ -195,10 +221,34 @@ def test_optuna_samples_arguments_that_bisim_sac_takes() -> None:
 def test_optuna_leaves_off_what_the_tuned_method_leaves_off(monkeypatch: pytest.MonkeyPatch) -> None:
     tuned = {**SAC, "policy_kwargs": {"n_critics": 1}}
     monkeypatch.setattr(BisimExperimentManager, "tuned", tuned)
-    trial = optuna.create_study().ask()
-    sampled = sample_bisim_sac_params(trial, 1, 1, {"using_her_replay_buffer": False, "her_kwargs": {}})
+    sampled = sample_bisim_sac_params(optuna.create_study().ask(), 1, 1, NO_HER)
     assert not sampled.keys() & {"bisim_coef", "intrinsic_reward_scale", "inverse_dynamics_coef"}
     assert sampled["policy_kwargs"].keys() == {"n_critics", "net_arch"}
+    monkeypatch.setattr(BisimExperimentManager, "tuned", {})  # BisimSAC's defaults: the metric alone
+    sampled = sample_bisim_sac_params(optuna.create_study().ask(), 1, 1, NO_HER)
+    assert "bisim_coef" in sampled
+    assert not sampled.keys() & {"intrinsic_reward_scale", "inverse_dynamics_coef"}
+
+
+def test_a_trial_is_repeated_with_the_settings_that_it_was_found_with(
+    zoo: Zoo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    storage = f"sqlite:///{tmp_path}/study.db"
+    study = optuna.create_study(storage=storage, study_name="pendulum")
+    layers = {"features_extractor_kwargs": {"n_layers": 3}}
+    monkeypatch.setattr(BisimExperimentManager, "tuned", {"bisim_coef": 0.5, "policy_kwargs": layers})
+    for _ in range(2):
+        trial = study.ask()
+        sampled = sample_bisim_sac_params(trial, 1, 1, NO_HER)
+        study.tell(trial, 0.0)
+    zoo(
+        *("train", "--env", PENDULUM, "--variant", "DBC", "--eval-freq", "-1", "-n", "20", "-f", str(tmp_path)),
+        *("--storage", storage, "--study-name", "pendulum", "--trial-id", "1"),
+    )
+    run = tmp_path / "bisim_sac" / "robust_bisim-SparsePendulum-v0_1" / "robust_bisim-SparsePendulum-v0"
+    trained = yaml.unsafe_load((run / "config.yml").read_text())
+    assert trained["bisim_coef"] == sampled["bisim_coef"]  # not the variant's
+    assert trained["policy_kwargs"] == {**layers, "net_arch": sampled["policy_kwargs"]["net_arch"]}
 
 
 def test_it_runs_as_a_module_and_help_tells_of_the_commands_and_of_our_options(zoo: Zoo) -> None:

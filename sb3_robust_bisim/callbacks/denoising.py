@@ -44,6 +44,12 @@ class DenoisingFactorCallback(EnvironmentCallback):
                 f'env_kwargs={self.env_kwargs}: no NoiseObservation and no info["clean_obs"], so no state can be seen with '
                 "other noise. Noisy tasks need noise_multiplier > 0, pixel tasks env_kwargs={'clean_obs': True}."
             )
+        if self.noise is not None and self.noise.observation_space.shape != self.model.observation_space.shape:
+            raise ValueError(
+                f"observations of shape {self.model.observation_space.shape}, where NoiseObservation gives "
+                f"{self.noise.observation_space.shape}: in a stack of frames the noise of the older ones stays as it was. "
+                "Use this callback without VecFrameStack."
+            )
 
     def _measure(self) -> None:
         pairs = list(islice(self._pairs(), self.n_states))

@@ -115,9 +115,9 @@ class KeyCamera(Camera):
     """
     A view in which a distractor takes the place of the sky and of all planes: the ground and the walls.
 
-    Neither is drawn, nor anything that would mix an object's colour with theirs, so that exactly the pixels that no object
-    covers stay black. A key on colour, by contrast, eats blue objects and leaves a fringe around the others. A height field
-    (the terrain of ``quadruped-escape``) is an object: it hides what lies behind it.
+    Neither is drawn, nor anything that would mix an object's colour with theirs, so that the pixels that no object covers stay
+    black, and those alone. A key on colour, by contrast, eats blue objects and leaves a fringe around the others. A height
+    field (the terrain of ``quadruped-escape``) is an object: it hides what lies behind it.
 
     :param physics: a dm_control physics
     :param camera_id: number or name of a camera of the model

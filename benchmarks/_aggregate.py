@@ -134,8 +134,9 @@ def tables(results: list[Result], figure: Figure, out: Path) -> dict[str, Any]:
         panels[panel] = {m: _ending(of(results, panel=panel, method=m), final, ends.get(FULL)) for m, final in ends.items()}
     splits = list(dict.fromkeys(split for panel in figure.panels.values() for split in panel.splits))
     played = [f"final agent on {split} clips" for split in splits]
-    heads = ["task", "method", "runs", "last return ± s.e.", "IQM [95 %]", "P(full is better) [95 %]", *played, "largest norm"]
-    lines = [" | ".join(["", *heads, "minutes", ""]).strip(), "|---" * (len(heads) + 1) + "|"]
+    heads = ["task", "method", "runs", "last return of each", "mean ± s.e.", "IQM [95 %]", "P(full is better) [95 %]", *played]
+    heads += ["largest norm", "minutes"]
+    lines = [" | ".join(["", *heads, ""]).strip(), "|---" * len(heads) + "|"]
     for panel, methods in panels.items():
         for method, row in methods.items():
             error = "" if row["standard_error"] is None else f" ± {row['standard_error']}"
@@ -145,6 +146,7 @@ def tables(results: list[Result], figure: Figure, out: Path) -> dict[str, Any]:
                 panel,
                 method,
                 row["runs"],
+                ", ".join(f"{value:.4g}" for value in row["final_returns"]),
                 f"{row['mean']}{error}",
                 "{} [{}, {}]".format(*row["iqm"]) if row["runs"] >= MANY else "",
                 better,

@@ -16,6 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sb3_robust_bisim import BisimSAC
 from sb3_robust_bisim.callbacks import DenoisingFactorCallback, EmbeddingCallback, ValueBoundCallback
+from sb3_robust_bisim.checkpoint import Checkpoint, load_checkpoint
 from sb3_robust_bisim.envs import NoiseObservation
 
 SETTINGS: dict[str, Any] = dict(
@@ -188,6 +189,17 @@ def test_a_watched_run_is_bit_for_bit_the_run_without(tmp_path: Path) -> None:
     watched, alone = (learn(tmp_path, callback) for callback in (callbacks, None))
     for name, value in watched.policy.state_dict().items():
         assert th.equal(value, alone.policy.state_dict()[name]), name
+
+
+def test_a_run_that_goes_on_is_looked_at_at_the_same_steps(tmp_path: Path) -> None:
+    checkpoint = tmp_path / "checkpoint.pkl"
+    callback = DenoisingFactorCallback(every=30, n_states=10)
+    learn(tmp_path, [callback, Checkpoint(checkpoint, 40, context=callback)], steps=50)
+    model, callback = load_checkpoint(checkpoint)
+    assert model.num_timesteps == 40
+    model.learn(60, callback, reset_num_timesteps=False)
+    looks = events(tmp_path).Scalars("bisim/denoising_factor")
+    assert [event.step for event in looks] == [30, 50, 60, 90, 100]  # 50 was the end of the part that is lost
 
 
 def test_a_zoo_yaml_can_name_them(tmp_path: Path) -> None:

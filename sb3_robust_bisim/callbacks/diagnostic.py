@@ -40,23 +40,29 @@ class DiagnosticCallback(BaseCallback):
                 raise ValueError(f"{name}={value!r}: {type(self).__name__} needs an integer >= {lowest}.")
         self.every = every
         self.n_states = n_states
-        self._last_look = 0
+        self._last_look: int | None = None
 
     def _on_training_start(self) -> None:
         if not isinstance(self.model, BisimSAC):
             raise ValueError(f"{type(self).__name__} looks at embeddings: it works with BisimSAC, not {type(self.model)}.")
-        self._last_look = self.num_timesteps
+        if self._last_look is None or self._last_look > self.num_timesteps:  # else a run goes on, from a checkpoint perhaps
+            self._last_look = self.num_timesteps
         with _undisturbed(self.model):
             self._prepare()
 
     def _on_step(self) -> bool:
-        if self.num_timesteps - self._last_look >= self.every:
+        if self._steps_since >= self.every:
             self._look()
         return True
 
     def _on_training_end(self) -> None:
-        if self.num_timesteps > self._last_look:
+        if self._steps_since > 0:
             self._look()
+
+    @property
+    def _steps_since(self) -> int:
+        assert self._last_look is not None  # set when training starts
+        return self.num_timesteps - self._last_look
 
     def _look(self) -> None:
         self._last_look = self.num_timesteps

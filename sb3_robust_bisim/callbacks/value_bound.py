@@ -19,7 +19,8 @@ class ValueBoundCallback(EnvironmentCallback):
     only. Records ``bisim/value_bound_violations``, the fraction of pairs whose gap is larger; the means
     ``bisim/value_gap`` and ``bisim/value_bound``; and the scatter ``bisim/value_gap_against_bound``.
 
-    The theorem is about expected returns; a single return of a random task scatters around its own. The distance is what the
+    The theorem is about expected returns; a single return of a random task scatters around its own. The returns are the
+    environment's; with a bonus the metric has been trained on larger rewards than these. The distance is what the
     metric loss trains; ``huber`` is averaged over coordinates and no metric, so it may break the bound at any time.
 
     The arguments are those of :class:`EnvironmentCallback`; whole episodes are run until there are ``n_states`` states.

@@ -8,6 +8,7 @@ object.
 
 import argparse
 import contextlib
+import inspect
 import json
 import os
 import shlex
@@ -30,11 +31,13 @@ from _aggregate import draw, tables
 from _figures import FIGURES, Figure, Method, Panel
 from tqdm import tqdm
 
+from sb3_robust_bisim import BisimSAC
 from sb3_robust_bisim.zoo import check_keys, variant_settings
 
 ROOT = Path(__file__).resolve().parent
 CONFIG = ROOT.parent / "zoo_configs" / "bisim_sac.yml"
 MOST_SEEDS = 50
+DEFAULTS = {name: parameter.default for name, parameter in inspect.signature(BisimSAC).parameters.items()}
 LOGGED = ("embedding_norm_mean", "embedding_norm_max", "mu_bd", "mu_rd", "mu_ratio_target")
 
 
@@ -254,8 +257,6 @@ def play(folder: Path, identity: dict, split: str, n_episodes: int = 20) -> list
     from stable_baselines3.common.evaluation import evaluate_policy
     from stable_baselines3.common.vec_env import VecFrameStack
 
-    from sb3_robust_bisim import BisimSAC
-
     run, arguments = run_folder(folder)
     kwargs = {**arguments["env_kwargs"], "split": split}
     venv = VecFrameStack(make_vec_env(identity["env"], 1, seed=10_000, env_kwargs=kwargs), n_stack=3)
@@ -314,7 +315,7 @@ def check_current(runs: list[Run], out: Path) -> None:
     """A result from before a change of the configuration is not the run's, and must not be drawn beside later ones."""
     for run in runs:
         for result in ended([run], out):
-            here, there = run.settings, result["arguments"]
+            here, there = {**DEFAULTS, **run.settings}, {**DEFAULTS, **result["arguments"]}
             if differing := sorted(key for key in {*here, *there} if here.get(key) != there.get(key)):
                 pairs = ", ".join(f"{key} is {there.get(key)} there and {here.get(key)} in {CONFIG.name}" for key in differing)
                 sys.exit(

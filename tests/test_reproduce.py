@@ -153,9 +153,13 @@ def test_a_run_that_two_figures_share_is_run_once(tmp_path) -> None:
 
 def test_results_of_another_configuration_are_refused(tmp_path) -> None:
     recorded = json.loads((ROOT / "benchmarks/results/cartpole/N_m2_SAC_seed0.json").read_text())
+    path = tmp_path / "results" / "cartpole" / "N_m2_SAC_seed0.json"
+    path.parent.mkdir(parents=True)
+    recorded["arguments"]["intrinsic_reward_max"] = 0.1  # to state a default changes nothing
+    path.write_text(json.dumps(recorded))
+    assert reproduce(tmp_path, "cartpole", "--dry-run").returncode == 0
     recorded["arguments"]["batch_size"] = 64
-    (tmp_path / "results" / "cartpole").mkdir(parents=True)
-    (tmp_path / "results" / "cartpole" / "N_m2_SAC_seed0.json").write_text(json.dumps(recorded))
+    path.write_text(json.dumps(recorded))
     process = reproduce(tmp_path, "cartpole")
     assert process.returncode == 1
     assert "N_m=2 SAC seed 0 is another one's: batch_size is 64 there and 512 in bisim_sac.yml" in process.stderr

@@ -80,7 +80,7 @@ QUANTITIES: dict[str, tuple[Callable[[list[Result], str], Curve], str, str, str]
     "mean_return": (mean_curve, "return", "return, mean ± standard error", "linear"),
     "iqm_return": (iqm_curve, "return", "return, IQM, 95 % interval", "linear"),
     "embedding_norm_max": (median_curve, "embedding_norm_max", "largest norm, median and range", "log"),
-    "mu_ratio": (ratio_curve, "mu_bd", "$\\mu_{bd} / \\mu_{rd}$ (dashed: $c_R / (1 - c_T)$)", "log"),
+    "mu_ratio": (ratio_curve, "mu_bd", "$\\mu_{bd} / \\mu_{rd}$ (dotted: $c_R / (1 - c_T)$)", "log"),
 }
 
 
@@ -96,10 +96,11 @@ def draw(results: list[Result], figure: Figure, out: Path) -> None:
                 if runs := of(results, panel=panel, method=method):
                     curve, key, _, _ = QUANTITIES[quantity]
                     lines = curve(runs, key)
-                    _draw_curve(axes[row, column], lines, method, f"C{color}")
+                    # two methods that do the same lie on each other
+                    _draw_curve(axes[row, column], lines, method, f"C{color}", "-" if color // 3 % 2 == 0 else "--")
                     if quantity == "mu_ratio":
                         target = np.nanmax(series(runs, "mu_ratio_target")[1])
-                        axes[row, column].axhline(target, color=f"C{color}", linestyle="--", linewidth=1)
+                        axes[row, column].axhline(target, color=f"C{color}", linestyle=":", linewidth=1)
                     values = zip(*lines, strict=True)
                     table += [[quantity, panel, method, len(runs), *(f"{v:.6g}" for v in point)] for point in values]
             _label(axes[row, column], quantity, panel if row == 0 else "", column == 0)
@@ -113,9 +114,9 @@ def draw(results: list[Result], figure: Figure, out: Path) -> None:
         csv.writer(file).writerows(table)
 
 
-def _draw_curve(ax: Axes, curve: Curve, label: str, color: str) -> None:
+def _draw_curve(ax: Axes, curve: Curve, label: str, color: str, linestyle: str) -> None:
     steps, middle, low, high = curve
-    ax.plot(steps, middle, label=label, color=color)
+    ax.plot(steps, middle, label=label, color=color, linestyle=linestyle)
     ax.fill_between(steps, low, high, color=color, alpha=0.2)
 
 

@@ -135,10 +135,21 @@ def runs_of(name: str, figure: Figure, seeds: int) -> list[Run]:
     ]
 
 
-def ended(runs: list[Run], out: Path) -> list[dict[str, Any]]:
-    """The results that are there, one for each run, whichever figure it was made for."""
-    found = ((finished(path, run.identity) for path in sorted(out.glob(f"*/{run.name}.json"))) for run in runs)
-    return [result for results in found if (result := next(filter(None, results), None))]
+def result_of(run: Run, out: Path) -> dict[str, Any] | None:
+    """The result of a run that has ended, whichever figure it was made for."""
+    for path in sorted(out.glob(f"*/{run.name}.json")):
+        if result := finished(path, run.identity):
+            check_settings(run, result, path)
+            return result
+    return None
+
+
+def check_settings(run: Run, result: dict[str, Any], path: Path) -> None:
+    """A result from before a change of the configuration is not the run's, and must not be drawn beside later ones."""
+    here, there = {**DEFAULTS, **run.settings}, {**DEFAULTS, **result["arguments"]}
+    if differing := sorted(key for key in {*here, *there} if here.get(key) != there.get(key)):
+        pairs = ", ".join(f"{key} is {there.get(key)} there and {here.get(key)} in {CONFIG.name}" for key in differing)
+        sys.exit(f"{path} was made with other settings: {pairs}. Move the older results of this figure away.")
 
 
 # --- what a worker does; it reaches other machines by value, and imports only what is installed there
@@ -311,19 +322,6 @@ def sweep(todo: list[Run], args: argparse.Namespace, out: Path, done: int) -> li
     return failed
 
 
-def check_current(runs: list[Run], out: Path) -> None:
-    """A result from before a change of the configuration is not the run's, and must not be drawn beside later ones."""
-    for run in runs:
-        for result in ended([run], out):
-            here, there = {**DEFAULTS, **run.settings}, {**DEFAULTS, **result["arguments"]}
-            if differing := sorted(key for key in {*here, *there} if here.get(key) != there.get(key)):
-                pairs = ", ".join(f"{key} is {there.get(key)} there and {here.get(key)} in {CONFIG.name}" for key in differing)
-                sys.exit(
-                    f"{out}: the result of {run.panel_name} {run.method_name} seed {run.seed} is another one's: {pairs}. "
-                    "Move the older results away."
-                )
-
-
 def setting(text: str) -> tuple[str, Any]:
     """``batch_size:128`` or ``distance:l1``"""
     key, colon, value = text.partition(":")
@@ -378,9 +376,9 @@ def main() -> None:
         for run in runs_of(name, figure, args.seeds or figure.seeds)
         if run.panel_name in (args.panels or figure.panels) and run.method_name in (args.methods or figure.methods)
     ]
-    check_current(runs, out)
-    todo = [run for run in runs if not ended([run], out)]
-    done = ended(runs, out)
+    results = {run: result_of(run, out) for run in runs}
+    todo = [run for run, result in results.items() if result is None]
+    done = [result for result in results.values() if result is not None]
     minutes = seconds_left(todo, done, figure) / 60
     rest = f"{minutes:.0f} minutes" if minutes < 90 else f"{minutes / 60:.1f} hours"
     left = f"the rest takes {rest} of one core" if todo else "nothing is left to run"
@@ -394,8 +392,7 @@ def main() -> None:
     if todo and not args.only_draw:
         failed = sweep(todo, args, out, sum(result["steps"] for result in done))
     every = runs_of(name, figure, max(MOST_SEEDS, args.seeds or 0))  # also what earlier sweeps have left
-    check_current(every, out)
-    done = ended(every, out)
+    done = [result for run in every if (result := result_of(run, out)) is not None]
     if not done:
         sys.exit("No run has ended yet.")
     draw(done, figure, out / name)

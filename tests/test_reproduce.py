@@ -162,7 +162,9 @@ def test_results_of_another_configuration_are_refused(tmp_path) -> None:
     path.write_text(json.dumps(recorded))
     process = reproduce(tmp_path, "cartpole")
     assert process.returncode == 1
-    assert "N_m=2 SAC seed 0 is another one's: batch_size is 64 there and 512 in bisim_sac.yml" in process.stderr
+    assert (
+        "N_m2_SAC_seed0.json was made with other settings: batch_size is 64 there and 512 in bisim_sac.yml" in process.stderr
+    )
     assert not (tmp_path / "work").exists()
 
 

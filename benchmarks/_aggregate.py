@@ -10,6 +10,7 @@ import numpy as np
 from _figures import Figure
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Picture
+from matplotlib.ticker import MaxNLocator
 from rliable import library, metrics
 
 from sb3_robust_bisim.atomic import atomic_path
@@ -106,6 +107,7 @@ def draw(results: list[Result], figure: Figure, out: Path) -> None:
             _label(axes[row, column], quantity, panel if row == 0 else "", column == 0)
     for column in range(len(panels)):
         axes[-1, column].set_xlabel("environment steps")
+        axes[-1, column].xaxis.set_major_locator(MaxNLocator(5))  # six digits each
     handles = {label: line for ax in axes.flat for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     picture.legend(handles.values(), handles, loc="outside lower center", ncols=min(len(handles), 2 * len(panels)))
     with atomic_path(out / "curves.png") as temporary:

@@ -26,6 +26,7 @@ import _machine
 import cloudpickle
 import joblib
 import numpy as np
+import torch as th
 import yaml
 from _aggregate import draw, tables
 from _figures import FIGURES, Figure, Method, Panel
@@ -362,6 +363,10 @@ def parse_arguments() -> argparse.Namespace:
     for option in ("seeds", "steps", "eval_freq", "jobs"):
         if (value := getattr(args, option)) is not None and value < 1:
             parser.error(f"--{option.replace('_', '-')} {value}: must be at least 1.")
+    try:
+        th.empty(0, device=args.device if args.backend == "loky" else "cpu")  # the workers' devices are not known here
+    except (RuntimeError, AssertionError) as error:
+        parser.error(f"--device {args.device}: there is none here ({str(error).splitlines()[0]}). Take cpu, say.")
     if (args.backend == "dask") != (args.scheduler is not None):
         parser.error("--backend dask and --scheduler ADDRESS belong together.")
     return args

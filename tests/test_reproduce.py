@@ -192,6 +192,7 @@ def test_a_run_that_broke_off_does_not_hide_the_others(tmp_path) -> None:
         (("cartpole", "--params", "batch_size=16"), "--params: unknown key 'batch_size=16'"),
         (("cartpole", "--params", "batch_size"), "batch_size: write KEY:VALUE"),
         (("cartpole", "--seeds", "0"), "--seeds 0: must be at least 1"),
+        (("cartpole", "--device", "quantum"), "--device quantum: there is none here"),
         (("cartpole", "--backend", "dask"), "--backend dask and --scheduler ADDRESS belong together"),
     ],
 )

@@ -1,0 +1,100 @@
+"""One gradient step, beside the equations of SAC and of the paper written out: every term, weight and sign of it."""
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.logger import configure
+
+from sb3_robust_bisim import BisimSAC
+
+ENV = "robust_bisim/SparseCartPole-v0"
+GAMMA, TAU, LEARNING_RATE, ALPHA, C_R, C_T = 0.9, 0.1, 0.01, 0.2, 2.0, 0.6
+BISIM_COEF, MODEL_COEF, INVERSE_DYNAMICS_COEF = 0.3, 0.7, 1.3
+
+
+def model_with_a_batch(**kwargs: Any) -> tuple[BisimSAC, Any]:
+    """A model whose buffer holds random transitions, half of them the last of an episode, and one batch of them."""
+    weights = dict(bisim_coef=BISIM_COEF, model_coef=MODEL_COEF, inverse_dynamics_coef=INVERSE_DYNAMICS_COEF)
+    # with plain gradient descent, how far a parameter moves is its gradient
+    policy_kwargs = dict(net_arch=[16], optimizer_class=th.optim.SGD)
+    settings: dict[str, Any] = dict(gamma=GAMMA, tau=TAU, c_r=C_R, c_t=C_T, ent_coef=f"auto_{ALPHA}", policy_delay=1)
+    settings |= dict(distance="l2", learning_rate=LEARNING_RATE, device="cpu", seed=0, policy_kwargs=policy_kwargs)
+    model = BisimSAC("MlpPolicy", ENV, **{**settings, **weights, **kwargs})
+    model.set_logger(configure(format_strings=[]))
+    rng = np.random.default_rng(0)
+    for step in range(64):
+        obs, next_obs = rng.standard_normal((2, 1, *model.observation_space.shape))
+        action, reward = rng.uniform(-1, 1, (1, 1)), rng.uniform(size=1)
+        model.replay_buffer.add(obs, next_obs, action, reward, np.array([step % 2]), [{}])
+    with th.no_grad():
+        for param in model.critic_target.parameters():
+            param.add_(0.1 * th.randn_like(param))  # else it equals the critic, and who takes which could not be told
+    batch = model.replay_buffer.sample(32)
+    model.replay_buffer.sample = lambda *args, **kwargs: batch
+    return model, batch
+
+
+def descended(loss: th.Tensor, params: list[th.Tensor]) -> list[th.Tensor]:
+    return [param - LEARNING_RATE * grad for param, grad in zip(params, th.autograd.grad(loss, params), strict=True)]
+
+
+def assert_close(actual: Any, expected: Any) -> None:
+    th.testing.assert_close(list(actual), list(expected), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("dynamics", ["deterministic", "probabilistic"])
+def test_an_update_is_that_of_the_equations(dynamics: str) -> None:
+    model, (obs, actions, next_obs, dones, rewards, *_) = model_with_a_batch(dynamics=dynamics)
+    old: Any = copy.deepcopy(model.policy)
+    th.manual_seed(1)
+    model.train(gradient_steps=1)
+    logged = model.logger.name_to_value
+
+    th.manual_seed(1)  # next actions, a sample of the model, pairs and actions are drawn in this order
+    z, next_z = old.critic.encode(obs), old.critic.encode(next_obs)
+    with th.no_grad():
+        next_actions, next_log_prob = old.actor.action_log_prob(next_obs)
+        next_q = th.minimum(*old.critic_target(next_obs, next_actions)) - ALPHA * next_log_prob[:, None]
+        target = rewards + GAMMA * (1 - dones) * next_q
+    critic_loss = sum((q - target).square().mean() for q in old.critic(obs, actions))
+    mean, std = (None if moment is None else moment[0] for moment in old.dynamics(z, actions))
+    sampled, spread, error = mean, 0.0, (mean - next_z.detach()).square() / 2
+    if std is not None:
+        sampled = mean + std * th.randn_like(mean)
+        sampled = sampled * (model.radius / sampled.norm(dim=1, keepdim=True)).clamp(max=1)
+        error = error / std.square() + std.log()
+    dynamics_loss, reward_loss = error.mean(), (old.reward_model(sampled) - rewards).square().mean()
+    other = th.randperm(len(z))
+    if std is not None:
+        spread = (std - std[other]).square().sum(dim=1)
+    gap = (mean - mean[other]).square().sum(dim=1).add(spread).sqrt()
+    wanted = (C_R * (rewards - rewards[other]).abs()[:, 0] + C_T * gap).detach()
+    bisim_loss = ((z - z[other]).norm(dim=1) - wanted).square().mean()  # norm: some are paired with themselves
+    inverse_dynamics_loss = (old.inverse_dynamics(z, next_z) - actions).abs().mean()
+    names = ("critic_loss", "dynamics_loss", "reward_loss", "bisim_loss", "inverse_dynamics_loss")
+    terms = (critic_loss, dynamics_loss, reward_loss, bisim_loss, inverse_dynamics_loss)
+    for name, term in zip(names, terms, strict=True):
+        assert logged[f"train/{name}"] == pytest.approx(term.item(), rel=1e-4), name
+
+    total = critic_loss + MODEL_COEF * (dynamics_loss + reward_loss) + BISIM_COEF * bisim_loss
+    total = total + INVERSE_DYNAMICS_COEF * inverse_dynamics_loss
+    trained = [[*policy.critic.parameters(), *policy.dynamics.parameters()] for policy in (model.policy, old)]
+    assert_close(trained[0], descended(total, trained[1]))
+
+    # the actor sees the new critics, on the embedding that the old encoder gave
+    sampled_actions, log_prob = old.actor.action_log_prob(obs)
+    q = th.minimum(*model.critic.q_values(z.detach(), sampled_actions))
+    actor_loss = (ALPHA * log_prob[:, None] - q).mean()
+    assert logged["train/actor_loss"] == pytest.approx(actor_loss.item(), rel=1e-4)
+    assert_close(model.policy.actor_parameters(), descended(actor_loss, old.actor_parameters()))
+
+    # more entropy than wanted: less weight on it. SB3 trains the logarithm, by Adam, whose first step is the sign
+    surplus = (-log_prob.mean() - model.target_entropy).item()
+    assert logged["train/ent_coef_loss"] == pytest.approx(np.log(ALPHA) * surplus, rel=1e-4)
+    assert model.log_ent_coef.item() == pytest.approx(np.log(ALPHA) - LEARNING_RATE * np.sign(surplus), rel=1e-4)
+
+    followed = [(1 - TAU) * a + TAU * b for a, b in zip(old.critic_target.parameters(), model.critic.parameters(), strict=True)]
+    assert_close(model.critic_target.parameters(), followed)

@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from sb3_robust_bisim import losses
 from sb3_robust_bisim.atomic import atomic_path
-from sb3_robust_bisim.checks import check_arguments, check_names
+from sb3_robust_bisim.checks import check_arguments, check_names, check_number_of_envs
 from sb3_robust_bisim.fast_paths import exact_onednn_matmul, unchecked_distributions
 from sb3_robust_bisim.intrinsic_reward import IntrinsicRewardVecEnv, with_intrinsic_reward
 from sb3_robust_bisim.latent_models import Dynamics
@@ -46,8 +46,8 @@ class BisimSAC(SAC):
     :param c_t: c_T, weight of the transition term, in [0, 1). None: ``gamma``
     :param reward_range: (R_min, R_max) of one agent step: action repeat sums rewards. It sets the radius of the norm
         constraint. The bonus is not counted, and the paper takes (0, 1) for all its tasks
-    :param norm_constraint: hold embeddings and predictions in the ball of eq:constraint, with radius
-        c_R (R_max - R_min) / (2 (1 - c_T))
+    :param norm_constraint: hold embeddings and predictions in the L2 ball of eq:constraint, with radius
+        c_R (R_max - R_min) / (2 (1 - c_T)). Between points of it only ``distance="l2"`` is at most the metric's diameter
     :param distance: "huber" (elementwise, the paper's experiments), "l1" or "l2" (norms of the whole embedding);
         see :func:`sb3_robust_bisim.losses.pairwise_distance`
     :param dynamics: "deterministic", "probabilistic" (Gaussian) or "ensemble" (5 Gaussians)
@@ -370,6 +370,7 @@ class BisimSAC(SAC):
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         env = self._wrap_env(env, self.verbose)
         check_for_correct_spaces(env, self.observation_space, self.action_space)
+        check_number_of_envs(env, self.n_envs)
         before = self.env
         super().set_env(self._bind_intrinsic_reward(env), force_reset)
         if before is not None and before is not self.env:  # nobody learns from the old one's bonus any more
@@ -389,7 +390,7 @@ class BisimSAC(SAC):
         **kwargs: Any,
     ) -> SelfBisimSAC:
         """Like SB3's ``load``; ``kwargs`` replace what the model was saved with, and must be arguments that exist."""
-        check_names(BisimSAC, kwargs)
+        check_names(cls, kwargs)
         return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
 
     def _store_transition(
@@ -447,11 +448,18 @@ class BisimSAC(SAC):
 
 
 def _is_same(obs: Any, other: Any) -> bool:
-    """Whether both are one observation: one object, or one the transposed view of the other, as VecTransposeImage makes it."""
+    """Whether both are one observation: one object, or one the channels-first view of the other (VecTransposeImage)."""
     if obs is other:
         return True
-    views = isinstance(obs, np.ndarray) and isinstance(other, np.ndarray) and (obs.base is other or other.base is obs)
-    return views and obs.size == other.size
+    return _is_channels_first_view(obs, other) or _is_channels_first_view(other, obs)
+
+
+def _is_channels_first_view(view: Any, images: Any) -> bool:
+    if not (isinstance(view, np.ndarray) and isinstance(images, np.ndarray) and view.ndim == images.ndim == 4):
+        return False
+    expected = images.transpose(0, 3, 1, 2)
+    same_layout = (view.shape, view.strides) == (expected.shape, expected.strides)
+    return same_layout and view.ctypes.data == expected.ctypes.data
 
 
 def _embedding_statistics(z: th.Tensor, radius: float | None) -> dict[str, th.Tensor]:
@@ -467,6 +475,5 @@ def _embedding_statistics(z: th.Tensor, radius: float | None) -> dict[str, th.Te
         "bisim/embedding_std": z.std(dim=0, unbiased=False).mean(),
     }
     if radius is not None:
-        # projected vectors lie on the surface, up to rounding
-        statistics["bisim/clamp_fraction"] = (norm > radius * (1 - 2 * losses.ROUNDING)).float().mean()
+        statistics["bisim/clamp_fraction"] = losses.on_surface(norm, radius).float().mean()
     return statistics

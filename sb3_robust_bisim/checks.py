@@ -10,6 +10,7 @@ from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac.sac import SAC
 
 from sb3_robust_bisim.latent_models import DYNAMICS
@@ -64,6 +65,11 @@ def check_arguments(model: "BisimSAC") -> None:
             f"intrinsic_reward_scale={model.intrinsic_reward_scale} with HerReplayBuffer: relabelled transitions get the "
             "environment's reward, without the bonus. Set intrinsic_reward_scale=0."
         )
+    for name in sorted({"radius", "dynamics", "bf16"} & set(model.policy_kwargs)):
+        remedy = (
+            "it follows from norm_constraint, c_r, c_t and reward_range" if name == "radius" else f"pass {name} to BisimSAC"
+        )
+        raise ValueError(f"policy_kwargs with {name}={model.policy_kwargs[name]!r}: BisimSAC sets it; {remedy}.")
     if not (isinstance(model.policy_class, type) and issubclass(model.policy_class, BisimPolicy)):
         raise ValueError(f"policy={model.policy_class!r}: it must be a subclass of sb3_robust_bisim.policies.BisimPolicy.")
     if "features_extractor_class" not in model.policy_kwargs:
@@ -95,11 +101,21 @@ def _require(condition: Any, model: "BisimSAC", name: str, remedy: str) -> None:
 
 
 def check_names(algorithm: type, kwargs: dict[str, Any]) -> None:
-    """Refuse an argument that neither BisimSAC nor SAC has, for a misspelt key in a config must not train half a method."""
-    known = [*inspect.signature(algorithm).parameters, *inspect.signature(SAC).parameters]
+    """Refuse an argument that no class from ``algorithm`` to SAC has: a misspelt key must not train half a method."""
+    lineage = algorithm.__mro__[: algorithm.__mro__.index(SAC) + 1]
+    known = [name for cls in lineage for name in inspect.signature(cls).parameters]
     for name in kwargs:
         if name not in known:
             raise TypeError(f"BisimSAC has no argument {name!r} (value {kwargs[name]!r}){closest(name, known)}")
+
+
+def check_number_of_envs(env: VecEnv, n_envs: int) -> None:
+    """What SB3's ``set_env`` asserts, before the bonus is bound to an environment that is then refused."""
+    if env.num_envs != n_envs:
+        raise ValueError(
+            f"env with num_envs={env.num_envs}: the model has {n_envs}. Pass as many, or BisimSAC.load(path, env=env), which "
+            "takes any number."
+        )
 
 
 def closest(name: str, known: Iterable[str]) -> str:

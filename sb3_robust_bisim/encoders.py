@@ -15,6 +15,7 @@ class MlpEncoder(BaseFeaturesExtractor):
     :param features_dim: width n of the embedding and of the hidden layers
     :param n_layers: linear layers, at least 1
     :param layer_norm: normalise the embedding (and each hidden layer)
+    :raises ValueError: for ``n_layers`` below 1
     """
 
     def __init__(
@@ -37,6 +38,7 @@ class PixelEncoder(BaseFeaturesExtractor):
     :param observation_space: channel-first image stack, (C, H, W)
     :param features_dim: width n of the embedding
     :param normalized_image: whether the space holds floats in [0, 1] already, see SB3's NatureCNN
+    :raises ValueError: for a space that does not hold images
     """
 
     def __init__(self, observation_space: spaces.Box, features_dim: int = 50, normalized_image: bool = False) -> None:

@@ -30,8 +30,8 @@ def exact_onednn_matmul(device: th.device) -> Iterator[None]:
     On a CPU, take oneDNN's matrix product in place of MKL's where it is as exact and therefore only faster.
 
     MKL does not use AVX-512 on processors of other makers; oneDNN does, but PyTorch gives it fp32 products only when lower
-    precision is allowed. Where the processor has no lower precision to offer, the result is exact all the same, which is
-    tested before. Everywhere else, and on a GPU, nothing changes.
+    precision is allowed. Whether oneDNN then makes use of the permission is tried once: where its products stay exact,
+    this takes them. Everywhere else, and on a GPU, nothing changes.
 
     :param device: where the model is
     """
@@ -45,11 +45,13 @@ def exact_onednn_matmul(device: th.device) -> Iterator[None]:
 @contextmanager
 def _bf16_allowed() -> Iterator[None]:
     matmul: Any = th.backends.mkldnn.matmul  # type: ignore[attr-defined]
-    precision, matmul.fp32_precision = matmul.fp32_precision, "bf16"
+    precision, inherited = matmul.fp32_precision, th.backends.mkldnn.fp32_precision
+    matmul.fp32_precision = "bf16"
     try:
         yield
     finally:
-        matmul.fp32_precision = precision
+        # what is read may be the parent's: written back as our own, it would not follow the parent any more
+        matmul.fp32_precision = "none" if precision == inherited else precision
 
 
 @cache

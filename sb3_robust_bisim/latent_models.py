@@ -36,15 +36,19 @@ class Prediction(NamedTuple):
 
 class DynamicsModel(nn.Module):
     """
-    Forward model with one hidden layer of 512, LayerNorm and ReLU. Its mean is held inside the ball (eq:constraint).
+    Forward model with one hidden layer, LayerNorm and ReLU. Its mean is held inside the ball (eq:constraint).
 
     :param features_dim: width n of the embedding
     :param action_dim: n_a
     :param kind: "deterministic" (a point mass), "probabilistic" (a diagonal Gaussian) or "ensemble" (5 Gaussians)
     :param radius: radius of the ball, or None for no constraint
+    :param hidden_dim: width of the hidden layer
+    :raises ValueError: for another ``kind``
     """
 
     def __init__(self, features_dim: int, action_dim: int, kind: str, radius: float | None, hidden_dim: int = 512) -> None:
+        if kind not in DYNAMICS:
+            raise ValueError(f"kind={kind!r}: it must be one of {', '.join(DYNAMICS)}.")
         super().__init__()
         self.probabilistic = kind != "deterministic"
         self.radius = radius
@@ -76,7 +80,7 @@ class DynamicsModel(nn.Module):
 
 
 def reward_model(features_dim: int, hidden_dim: int = 512) -> nn.Module:
-    """r(z'): (B, n) -> (B, 1); one hidden layer of 512 with LayerNorm and ReLU."""
+    """r(z'): (B, n) -> (B, 1); one hidden layer, 512 wide by default, with LayerNorm and ReLU."""
     return nn.Sequential(*create_mlp(features_dim, 1, [hidden_dim], post_linear_modules=[nn.LayerNorm]))
 
 

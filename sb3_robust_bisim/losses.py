@@ -3,7 +3,7 @@
 Shapes: ``B`` is the batch size, ``n`` the width of the embedding, ``K`` the number of dynamics models.
 """
 
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch as th
 from torch.nn import functional as F
@@ -17,6 +17,9 @@ def ball_radius(c_r: float, c_t: float, reward_range: tuple[float, float]) -> fl
     """
     Radius of the ball that holds every embedding, eq:constraint: half the largest diameter that a bisimulation
     metric can have (lemma:diam).
+
+    The ball is one of the L2 norm whatever the distance, as in the published experiments. So it is l2 distances that it
+    keeps within that diameter; l1 distances in it reach sqrt(n) times as far.
 
     :param c_r: weight of the reward term, c_R >= 0
     :param c_t: weight of the transition term, c_T in [0, 1)
@@ -34,13 +37,27 @@ def project_to_ball(x: th.Tensor, radius: float | None) -> th.Tensor:
     The surface is meant up to rounding, from the inside: what comes out is never longer than ``radius``.
 
     :param x: (..., n)
-    :param radius: None leaves everything as it is
+    :param radius: above 0; None leaves everything as it is
     :return: (..., n)
+    :raises ValueError: for a radius of 0 or less
     """
     if radius is None:
         return x
+    if radius <= 0:
+        raise ValueError(f"radius={radius}: the ball needs a radius above 0, or None for no ball.")
     excess = x.norm(dim=-1, keepdim=True) / radius
     return x / th.where(excess > 1, excess * (1 + ROUNDING), 1.0)
+
+
+def on_surface(norm: Any, radius: float) -> Any:
+    """
+    Which vectors lie on the surface of the ball, where :func:`project_to_ball` brings what was outside.
+
+    :param norm: L2 norms of projected vectors, a tensor or an array
+    :param radius: of the ball
+    :return: booleans in the shape of ``norm``
+    """
+    return norm > radius * (1 - 2 * ROUNDING)
 
 
 def pairwise_distance(x: th.Tensor, y: th.Tensor, distance: str) -> th.Tensor:
@@ -54,7 +71,9 @@ def pairwise_distance(x: th.Tensor, y: th.Tensor, distance: str) -> th.Tensor:
     :param y: (B, n)
     :param distance: "huber", "l1" or "l2"
     :return: (B, n) for "huber", else (B, 1)
+    :raises ValueError: for another distance
     """
+    _check_distance(distance)
     if distance == "huber":
         return F.smooth_l1_loss(x, y, reduction="none")
     return (x - y).norm(p=1 if distance == "l1" else 2, dim=-1, keepdim=True)
@@ -69,12 +88,20 @@ def gaussian_w2(mean_i: th.Tensor, std_i: th.Tensor, mean_j: th.Tensor, std_j: t
     ``huber`` keeps the coordinates apart as the paper's experiments do.
 
     :param mean_i: (B, n), likewise the other three
+    :param distance: "huber", "l1" or "l2"
     :return: (B, n) for "huber", else (B, 1)
+    :raises ValueError: for another distance
     """
+    _check_distance(distance)
     squared = (mean_i - mean_j).square() + (std_i - std_j).square()
     if distance == "l2":
         return squared.sum(dim=-1, keepdim=True).sqrt()
     return squared.sqrt() if distance == "huber" else squared.sqrt().sum(dim=-1, keepdim=True)
+
+
+def _check_distance(distance: str) -> None:
+    if distance not in DISTANCES:
+        raise ValueError(f"distance={distance!r}: it must be one of {', '.join(DISTANCES)}.")
 
 
 def bisim_loss(

@@ -9,10 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import ot
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csr_array
-from scipy.spatial.distance import pdist, squareform
+
+try:
+    import ot
+    from scipy.sparse import csr_array
+    from scipy.spatial.distance import pdist, squareform
+except ImportError as error:
+    raise ImportError(f'{error}: exact metrics and bounds need pip install "sb3_robust_bisim[theory]".') from error
 
 Array = NDArray[np.float64]
 

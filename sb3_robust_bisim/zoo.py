@@ -3,6 +3,7 @@
 import argparse
 import inspect
 import sys
+import tempfile
 from contextlib import closing
 from pathlib import Path
 from typing import Any, ClassVar
@@ -16,7 +17,7 @@ from matplotlib.figure import Figure
 from rl_zoo3 import ALGOS
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, convert_offpolicy_params, sample_sac_params
-from rl_zoo3.utils import get_class_by_name
+from rl_zoo3.utils import EnvironmentName, get_class_by_name
 from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
@@ -91,6 +92,24 @@ def check_keys(hyperparams: dict[str, Any], source: str) -> None:
             raise ValueError(f"{source}: unknown key {key!r}{closest(key, known)}")
 
 
+def check_task(env_id: str, config: str) -> None:
+    """
+    Refuse a task without an entry, for the zoo does not say which there are.
+
+    :param env_id: the task
+    :param config: file of hyperparameters; only a YAML file can be looked into
+    :raises ValueError: naming the tasks that have one
+    """
+    if not config.endswith((".yml", ".yaml")):
+        return
+    tasks = [key for key in yaml.safe_load(Path(config).read_text()) if key != "variants"]
+    if env_id not in tasks:
+        raise ValueError(
+            f"--env {env_id}: {config} has settings for {', '.join(tasks)}. Copy the entry of a task that is like yours, in "
+            "this file or in one of your own, which -conf names."
+        )
+
+
 class BisimExperimentManager(ExperimentManager):
     """
     The zoo's experiment manager, plus named variants, evaluation in another task, key checks, exact continuation and a report
@@ -116,6 +135,8 @@ class BisimExperimentManager(ExperimentManager):
                 BisimExperimentManager.variants = trained.get("variant", [])
                 params = {**(trained.get("hyperparams") or {}), **params}
                 self.args.hyperparams = params  # kept in the run's args.yml, for the next time
+        if self.algo == ALGO:
+            check_task(self.env_name.gym_id, self.config)
         # entry < variants < Optuna's trial < -params
         settings = variant_settings(self.config, self.env_name.gym_id, *self.variants) if self.variants else {}
         self.custom_hyperparams = {**settings, **self._trial_settings(settings), **params}
@@ -206,6 +227,8 @@ class BisimExperimentManager(ExperimentManager):
         title = f"{self.env_name} {' '.join(self.variants) or self.algo}"
         if self.checkpoint is not None and model.num_timesteps >= self.n_timesteps:
             self.checkpoint.unlink(missing_ok=True)  # nothing is left to go on with
+        if model.num_timesteps < model._total_timesteps:
+            print(f"Stopped at step {model.num_timesteps} of {model._total_timesteps}.")
         report(Path(self.save_path), title, -1 if self.continue_training else getattr(model, "learning_starts", -1))
         if self.algo == ALGO and is_image_space(model.observation_space):
             self._record(model)
@@ -257,7 +280,7 @@ def report(run: Path, title: str, learning_starts: int) -> None:
     print(f"  {'before training' if steps[0] <= learning_starts else 'at first'} (step {steps[0]}): {mean[0]:.1f}")
     best = int(mean.argmax())
     print(f"  best (step {steps[best]}): {mean[best]:.1f}, kept as {run / 'best_model.zip'}")
-    print(f"  after training (step {steps[-1]}): {mean[-1]:.1f}")
+    print(f"  {'after' if steps[-1] > learning_starts else 'still before'} training (step {steps[-1]}): {mean[-1]:.1f}")
     print(f"Learning curve: {run / 'learning_curve.png'}")
 
 
@@ -276,8 +299,8 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(0 if sys.argv[1:] in (["-h"], ["--help"]) else 2)
     if sys.argv[1] == "train":
         sys.argv[2:] = _train_arguments(sys.argv[2:])
-    elif sys.argv[1] == "enjoy" and "--algo" not in sys.argv:
-        sys.argv[2:2] = ["--algo", ALGO]
+    elif sys.argv[1] == "enjoy":
+        sys.argv[2:] = _enjoy_arguments(sys.argv[2:])
     command = sys.argv.pop(1)
     if command == "train":
         rl_zoo3.train.train()
@@ -290,6 +313,25 @@ def main(arguments: list[str] | None = None) -> None:
             raise ImportError(f"{command} needs the extra `plots`: pip install sb3_robust_bisim[plots]") from error
         sys.argv.insert(1, command)
         cli.main()
+
+
+def _enjoy_arguments(arguments: list[str]) -> list[str]:
+    """
+    Fill in ``--algo``, the folder that training writes to, and the newest run that has an agent: the zoo takes the newest
+    folder, also one that Optuna or a run that failed has left.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--algo", default=ALGO)
+    parser.add_argument("-f", "--folder", default="logs")
+    parser.add_argument("--exp-id", type=int, default=0)
+    parser.add_argument("--env", type=EnvironmentName, default=None)
+    ours, theirs = parser.parse_known_args(arguments)
+    if ours.exp_id == 0 and ours.env is not None:
+        runs = Path(ours.folder, ours.algo).glob(f"{ours.env}_*/*.zip")
+        numbers = [suffix for run in runs if (suffix := run.parent.name.removeprefix(f"{ours.env}_")).isdigit()]
+        ours.exp_id = max(map(int, numbers), default=0)
+    env = [] if ours.env is None else ["--env", ours.env.gym_id]
+    return ["--algo", ours.algo, "-f", ours.folder, "--exp-id", str(ours.exp_id), *env, *theirs]
 
 
 def _train_arguments(arguments: list[str]) -> list[str]:
@@ -334,6 +376,8 @@ def _train_arguments(arguments: list[str]) -> list[str]:
         parser.error(f"--checkpoint-freq {ours.checkpoint_freq}: at least one step must lie between two checkpoints.")
     if ours.checkpoint is not None and {"-optimize", "--optimize-hyperparameters"} & set(arguments):
         parser.error("--checkpoint with -optimize: Optuna keeps its trials itself, see --storage.")
+    if ours.checkpoint is not None:
+        _check_writable(parser, ours.checkpoint)
     config = ours.conf_file or (str(DEFAULT_CONFIG) if ours.algo == ALGO and DEFAULT_CONFIG.is_file() else None)
     if ours.algo == ALGO and config is None and not {"-h", "--help"} & set(arguments):
         parser.error(f"-conf is needed: {DEFAULT_CONFIG} is not in this folder.")
@@ -341,3 +385,15 @@ def _train_arguments(arguments: list[str]) -> list[str]:
         parser.error(f"-conf {config}: there is no such file.")
     seed = [] if ours.seed is None else ["--seed", str(ours.seed)]
     return ["--algo", ours.algo, *(["-conf", config] if config else []), *seed, *theirs]
+
+
+def _check_writable(parser: argparse.ArgumentParser, checkpoint: Path) -> None:
+    """What would otherwise be found at the first checkpoint, thousands of steps later."""
+    if checkpoint.is_dir():
+        parser.error(f"--checkpoint {checkpoint}: this is a folder; name a file in it.")
+    try:
+        checkpoint.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=checkpoint.parent):
+            pass
+    except OSError as error:
+        parser.error(f"--checkpoint {checkpoint}: {error.strerror}; name a file where you may write.")

@@ -160,6 +160,21 @@ def test_a_bonus_below_a_frame_stack_is_refused(policy: str, env: Callable[[], g
         make_model(policy, VecFrameStack(IntrinsicRewardVecEnv(DummyVecEnv([env])), 2))
 
 
+def test_another_number_of_environments_is_refused_and_stays_unbound() -> None:
+    model, other = make_model(intrinsic_reward_scale=1.0), IntrinsicRewardVecEnv(DummyVecEnv([pendulum, pendulum]))
+    with pytest.raises(ValueError, match=r"num_envs=2: the model has 1\..*BisimSAC.load"):
+        model.set_env(other)
+    assert other._bonus is None
+
+
+@pytest.mark.parametrize(
+    ("name", "remedy"), [("radius", "norm_constraint"), ("dynamics", "pass dynamics"), ("bf16", "pass bf16")]
+)
+def test_what_the_model_sets_is_refused_as_policy_kwargs(name: str, remedy: str) -> None:
+    with pytest.raises(ValueError, match=f"policy_kwargs with {name}='x'.*{remedy}"):
+        make_model(policy_kwargs={name: "x"})
+
+
 def test_an_environment_with_other_spaces_is_refused_as_such() -> None:
     with pytest.raises(ValueError, match="Observation spaces do not match"):
         make_model().set_env(gym.make("MountainCarContinuous-v0"))
@@ -176,6 +191,18 @@ def test_load_refuses_a_misspelt_argument(tmp_path: Path) -> None:
     make_model().save(tmp_path / "model")
     with pytest.raises(TypeError, match="did you mean 'bisim_coef'"):
         BisimSAC.load(tmp_path / "model", bisim_coeff=0.1)
+
+
+def test_load_takes_the_arguments_of_a_subclass(tmp_path: Path) -> None:
+    class Renamed(BisimSAC):
+        def __init__(self, *args: Any, nickname: str = "", **kwargs: Any) -> None:
+            super().__init__(*args, **kwargs)
+            self.nickname = nickname
+
+    Renamed("MlpPolicy", pendulum(), **SMALL).save(tmp_path / "model")
+    assert Renamed.load(tmp_path / "model", nickname="b", c_t=0.5).nickname == "b"
+    with pytest.raises(TypeError, match="did you mean 'nickname'"):
+        Renamed.load(tmp_path / "model", nicknam="b")
 
 
 class RewardAt(gym.Wrapper):

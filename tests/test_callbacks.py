@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 import torch as th
 from rl_zoo3.utils import get_callback_list
-from stable_baselines3 import SAC
+from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_robust_bisim import BisimSAC
-from sb3_robust_bisim.callbacks import DenoisingFactorCallback, EmbeddingCallback, ValueBoundCallback
+from sb3_robust_bisim.callbacks import DenoisingFactorCallback, EmbeddingCallback, ValueBoundCallback, diagnostic
 from sb3_robust_bisim.checkpoint import Checkpoint, load_checkpoint
 from sb3_robust_bisim.envs import NoiseObservation
 
@@ -129,6 +130,21 @@ def test_the_plane_of_the_principal_components_is_drawn(tmp_path: Path) -> None:
     assert [image.step for image in images] == [30, 60]
     assert images[0].encoded_image_string.startswith(b"\x89PNG")
     assert images[0].encoded_image_string != images[1].encoded_image_string
+
+
+def test_the_projector_shows_of_hindsight_replay_what_may_be_drawn(tmp_path: Path) -> None:
+    env = gym.wrappers.TimeLimit(BitFlippingEnv(n_bits=10, continuous=True, max_steps=100), 30)
+    learn(
+        tmp_path,
+        EmbeddingCallback(every=20),
+        50,
+        env,
+        "MultiInputPolicy",
+        replay_buffer_class=HerReplayBuffer,
+        learning_starts=35,
+    )
+    shown = [len(np.loadtxt(path)) for path in sorted(tmp_path.glob("BisimSAC_1/*/embedding/tensors.tsv"))]
+    assert shown == [30, 30]  # at step 40 and at the end; at 20 no episode had ended
 
 
 def test_frames_become_sprites(tmp_path: Path) -> None:
@@ -245,6 +261,12 @@ def test_what_cannot_work_is_refused_when_training_starts(callback: BaseCallback
 def test_a_bound_needs_rewards_in_the_metric() -> None:
     with pytest.raises(ValueError, match="c_r > 0"):
         learn(None, ValueBoundCallback(), steps=10**9, c_r=0.0, norm_constraint=False)
+
+
+def test_episodes_without_end_are_named_in_place_of_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(diagnostic, "LONGEST_WALK", 5)
+    with pytest.raises(ValueError, match=r"n_states=20: ValueBoundCallback .* in 5 steps of robust_bisim/SparseCartPole-v0"):
+        learn(None, ValueBoundCallback(n_states=20), steps=1)
 
 
 def test_another_algorithm_is_refused() -> None:

@@ -1,5 +1,6 @@
 """Speed that leaves the result alone: nothing waits for the device, products stay exact, bf16 stays in the encoder."""
 
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -8,6 +9,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.envs import FakeImageEnv
 from torch.distributions import Distribution
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_robust_bisim import BisimSAC
@@ -19,13 +21,32 @@ EVERYTHING: dict[str, Any] = dict(
 )
 
 
-class Waits(TorchDispatchMode):
-    """Counts what reads a tensor's value on the host: `.item()`, `bool(tensor)`, `if tensor`."""
+class Reads(TorchDispatchMode):
+    """Counts what waits for a value: `.item()`, `bool(tensor)`, also inside PyTorch, and shapes that depend on values."""
 
-    count = 0
+    WAITING = ("_local_scalar_dense", "nonzero", "masked_select", "unique")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        self.count += func is th.ops.aten._local_scalar_dense.default
+        masks = (
+            [index for index in args[1] if index is not None and index.dtype == th.bool] if "index.Tensor" in str(func) else []
+        )
+        self.count += bool(masks) or any(name in str(func) for name in self.WAITING)
+        return func(*args, **(kwargs or {}))
+
+
+class Transfers(TorchFunctionMode):
+    """Counts transfers of whole tensors to the host, which a tensor on the CPU does not dispatch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.count += func in (th.Tensor.cpu, th.Tensor.numpy)
         return func(*args, **(kwargs or {}))
 
 
@@ -35,12 +56,17 @@ def test_no_gradient_step_waits_for_the_device(dynamics: str, use_sde: bool) -> 
     # a fixed entropy coefficient: Adam keeps the step counts of its default form on the CPU, and reads them there
     model = BisimSAC("MlpPolicy", ENV, ent_coef=0.1, dynamics=dynamics, use_sde=use_sde, **EVERYTHING).learn(20)
     model.train(gradient_steps=1, batch_size=8)  # the accuracy of the processor's products is tested once
-    with Waits() as waits:
+    with Reads() as reads, Transfers() as transfers:
         model.train(gradient_steps=6, batch_size=8)
-    assert waits.count == 0
-    with Waits() as waits:
-        bool(th.ones(1) > 0)
-    assert waits.count == 1  # it does count
+    assert reads.count == 0
+    assert transfers.count == 1  # at the end, of everything to be logged
+
+
+@pytest.mark.parametrize("wait", [th.Tensor.item, bool, th.nonzero, lambda x: x[x > 0], th.Tensor.cpu, th.Tensor.numpy])
+def test_what_would_wait_is_counted(wait: Callable[[th.Tensor], Any]) -> None:
+    with Reads() as reads, Transfers() as transfers:
+        wait(th.ones(1))
+    assert reads.count + transfers.count > 0
 
 
 def test_the_settings_of_torch_are_restored_also_after_an_error() -> None:
@@ -54,6 +80,15 @@ def test_the_settings_of_torch_are_restored_also_after_an_error() -> None:
     with pytest.raises(KeyError):
         fail()
     assert (Distribution._validate_args, matmul.fp32_precision) == before
+
+
+def test_the_precision_still_follows_the_setting_for_all_of_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    matmul: Any = th.backends.mkldnn.matmul  # type: ignore[attr-defined]
+    monkeypatch.setattr(th.backends, "fp32_precision", "ieee")
+    with exact_onednn_matmul(th.device("cpu")):
+        pass
+    monkeypatch.setattr(th.backends, "fp32_precision", "tf32")
+    assert matmul.fp32_precision == "tf32"
 
 
 def test_products_keep_the_accuracy_of_fp32() -> None:

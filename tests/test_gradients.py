@@ -78,10 +78,7 @@ def test_the_actor_loss_leaves_no_gradient_outside_the_actor() -> None:
     # the other optimizers stand still: whatever moves was moved by the actor loss
     for optimizer in (model.critic.optimizer, model.policy.inverse_dynamics.optimizer):
         optimizer.step = lambda: None
-        zero_grad = optimizer.zero_grad
-        optimizer.zero_grad = zero_grad
     model.tau = 0.0
-    encoder_gradients = []
     original = model.actor.optimizer.zero_grad
 
     def spy() -> None:
@@ -91,8 +88,7 @@ def test_the_actor_loss_leaves_no_gradient_outside_the_actor() -> None:
 
     model.actor.optimizer.zero_grad = spy
     model.train(gradient_steps=1, batch_size=16)
-    encoder_gradients = with_gradient(model)
-    assert encoder_gradients == {"actor"}
+    assert with_gradient(model) == {"actor"}
     moved = {
         name
         for name, net in nets(model).items()

@@ -189,6 +189,17 @@ class OneArray(VecEnvWrapper):
         return self.array, *rest
 
 
+class Mirror(VecEnvWrapper):
+    """Shows a view of every observation that is not what it was."""
+
+    def reset(self) -> np.ndarray:
+        return self.venv.reset()[:, ::-1]
+
+    def step_wait(self) -> Any:
+        obs, *rest = self.venv.step_wait()
+        return obs[:, ::-1], *rest
+
+
 def small_images() -> gym.Env:
     """Channel-last, so that SB3 puts a VecTransposeImage around the wrapper."""
     image = FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False)
@@ -217,6 +228,11 @@ COLLECTION: dict[str, tuple[str, Callable[[], VecEnv], dict[str, Any]]] = {
         {"train_freq": 4},
     ),
     "one array": ("MlpPolicy", lambda: OneArray(DummyVecEnv([Countdown] * 2)), {"learning_starts": 0, "gradient_steps": 0}),
+    "view": (
+        "MlpPolicy",
+        lambda: Mirror(IntrinsicRewardVecEnv(DummyVecEnv([Countdown] * 2))),
+        {"learning_starts": 0, "gradient_steps": 0},
+    ),
     # at a reset it returns the array of the observation before
     "VecFrameStack": (
         "MlpPolicy",

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_robust_bisim import losses
+from sb3_robust_bisim.latent_models import DynamicsModel
 
 SETTINGS = settings(max_examples=50, deadline=None, derandomize=True)
 
@@ -68,6 +69,24 @@ def test_projection_ends_in_the_ball_keeps_directions_and_leaves_the_interior_al
     assert th.equal(projected[inside], x[inside])
     th.testing.assert_close(projected[~inside], x[~inside] / norm[~inside, None] * radius)
     assert th.equal(losses.project_to_ball(x, None), x)
+
+
+def test_what_would_be_taken_for_something_else_is_refused() -> None:
+    x = th.ones(2, 3)
+    with pytest.raises(ValueError, match=r"radius=-1\.0"):
+        losses.project_to_ball(x, -1.0)
+    with pytest.raises(ValueError, match="distance='cosine'"):
+        losses.pairwise_distance(x, x, "cosine")
+    with pytest.raises(ValueError, match="distance='cosine'"):
+        losses.gaussian_w2(x, x, x, x, "cosine")
+    with pytest.raises(ValueError, match="kind='gaussian'"):
+        DynamicsModel(3, 1, "gaussian", None)
+
+
+def test_what_was_outside_is_told_from_what_was_inside() -> None:
+    x = th.stack([scale * th.nn.functional.normalize(th.randn(50), dim=0) for scale in (1e-3, 0.99, 0.9999, 1.01, 2.0, 1e3)])
+    norm = losses.project_to_ball(7.0 * x, 7.0).norm(dim=1)
+    assert losses.on_surface(norm, 7.0).tolist() == [False, False, False, True, True, True]
 
 
 def test_the_gradient_of_the_projection_is_finite_at_the_origin() -> None:

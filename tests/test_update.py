@@ -96,5 +96,7 @@ def test_an_update_is_that_of_the_equations(dynamics: str) -> None:
     assert logged["train/ent_coef_loss"] == pytest.approx(np.log(ALPHA) * surplus, rel=1e-4)
     assert model.log_ent_coef.item() == pytest.approx(np.log(ALPHA) - LEARNING_RATE * np.sign(surplus), rel=1e-4)
 
-    followed = [(1 - TAU) * a + TAU * b for a, b in zip(old.critic_target.parameters(), model.critic.parameters(), strict=True)]
+    followed = [
+        (1 - TAU) * a + TAU * b for a, b in zip(old.critic_target.parameters(), model.critic.parameters(), strict=True)
+    ]
     assert_close(model.critic_target.parameters(), followed)

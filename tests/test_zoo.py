@@ -1,5 +1,6 @@
 """The command line, run as a user runs it."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ import yaml
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER
 
 from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer
-from sb3_robust_bisim.zoo import BisimExperimentManager, check_keys, main, sample_bisim_sac_params, variant_settings
+from sb3_robust_bisim.zoo import BisimExperimentManager, check_keys, main, report, sample_bisim_sac_params, variant_settings
 
 ROOT = Path(__file__).parent.parent
 CONFIG = ROOT / "zoo_configs" / "bisim_sac.yml"
@@ -106,8 +107,10 @@ def test_train_evaluates_in_the_standard_task_and_reports_and_resumes_and_plays(
     assert (model.intrinsic_reward_scale, model.inverse_dynamics_coef) == (0.0, 0.3)  # still normed-ID, with its -params
     arguments = yaml.unsafe_load((second / "robust_bisim-SparseCartPole-v0" / "args.yml").read_text())
     assert arguments["hyperparams"]["inverse_dynamics_coef"] == 0.3  # and so would a third one
-    played = zoo("enjoy", "--env", CARTPOLE, "-f", str(tmp_path), "--exp-id", "1", "-n", "30", "--no-render")
-    assert "Episode Reward" in played or "Loading" in played
+    (tmp_path / "bisim_sac" / "robust_bisim-SparseCartPole-v0_3").mkdir()  # as Optuna or a run that failed leaves it
+    played = zoo("enjoy", "--env", CARTPOLE, "-f", str(tmp_path), "-n", "210", "--no-render")
+    assert "SparseCartPole-v0_2/" in played
+    assert "Episode Reward" in played
 
 
 def test_variants_are_laid_over_each_other() -> None:
@@ -180,6 +183,43 @@ def test_bad_input_is_refused_before_a_run_folder_exists(zoo: Zoo, arguments: li
     with pytest.raises(ValueError, match=message):
         zoo("train", "--env", CARTPOLE, *arguments, "-f", str(tmp_path / "logs"))
     assert not (tmp_path / "logs").exists()
+
+
+def test_a_task_without_settings_is_refused_with_those_that_have_some(zoo: Zoo, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"--env Pendulum-v1: .* robust_bisim/SparsePendulum-v0.* Copy the entry"):
+        zoo("train", "--env", "Pendulum-v1", "-f", str(tmp_path / "logs"))
+    assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize(
+    ("file", "message"), [("", "this is a folder"), ("a file/run.pkl", "name a file where you may write")]
+)
+def test_a_checkpoint_that_could_not_be_written_is_refused_at_once(zoo: Zoo, file: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "a file").touch()
+    with pytest.raises(SystemExit):
+        zoo("train", "--env", CARTPOLE, "--checkpoint", str(tmp_path / file), "-f", str(tmp_path / "logs"))
+    assert f"--checkpoint {tmp_path / file}: " in zoo.output
+    assert message in zoo.output
+
+
+@pytest.mark.parametrize(
+    ("starts", "last"), [(40, "still before training (step 40): 2.0"), (30, "after training (step 40): 2.0")]
+)
+def test_the_report_does_not_call_an_agent_trained_that_is_not(
+    starts: int, last: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    np.savez(tmp_path / "evaluations.npz", timesteps=[20, 40], results=[[1.0, 2.0], [3.0, 1.0]])
+    report(tmp_path, "a run", starts)
+    assert last in capsys.readouterr().out
+
+
+def test_a_run_that_was_stopped_says_so(zoo: Zoo, tmp_path: Path) -> None:
+    content = yaml.safe_load(CONFIG.read_text())
+    content[CARTPOLE]["callback"] = [{"stable_baselines3.common.callbacks.StopTrainingOnMaxEpisodes": {"max_episodes": 1}}]
+    config = tmp_path / "stops.yml"
+    config.write_text(yaml.dump(content))
+    output = zoo("train", "--env", CARTPOLE, "-conf", str(config), "-f", str(tmp_path), "--seed", "0", *SHORT)
+    assert re.search(r"Stopped at step \d\d of 120\.", output)
 
 
 def test_a_missing_config_file_is_named(zoo: Zoo) -> None:

@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper,
 
 from sb3_robust_bisim.bisim_sac import BisimSAC
 
+LONGEST_WALK = 100_000  # steps of one look, far more than it takes where episodes end
 NOT_FOR_FIGURES = ("stdout", "log", "json", "csv")
 
 
@@ -148,11 +149,15 @@ class EnvironmentCallback(DiagnosticCallback):
         """Run the present (stochastic) policy from the same seed on, for as long as somebody asks."""
         self.venv.seed(self.seed)
         obs = self.venv.reset()
-        while True:
+        for _ in range(LONGEST_WALK):
             actions, _ = self.model.predict(self._normalize(obs))
             next_obs, rewards, dones, infos = self.venv.step(actions)
             yield Step(obs, float(rewards[0]), bool(dones[0]), infos[0], next_obs)
             obs = next_obs
+        raise ValueError(
+            f"n_states={self.n_states}: {type(self).__name__} found fewer states to look at in {LONGEST_WALK} steps of "
+            f"{self.venv.get_attr('spec')[0].id}. Its episodes must end (max_episode_steps), and be longer than a frame stack."
+        )
 
     def _normalize(self, obs: Any) -> Any:
         normalize = self.model._vec_normalize_env

@@ -1,7 +1,9 @@
 """The embedding in TensorBoard: projector and principal components."""
 
+import numpy as np
 import torch as th
 from matplotlib.figure import Figure
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import PyTorchObs
@@ -41,6 +43,8 @@ class EmbeddingCallback(DiagnosticCallback):
         buffer = self.model.replay_buffer
         assert buffer is not None
         n_stored = buffer.size() * buffer.n_envs
+        if isinstance(buffer, HerReplayBuffer):  # draws from episodes that have ended
+            n_stored = int(np.count_nonzero(buffer.ep_length))
         if n_stored < 2:
             return
         batch = buffer.sample(min(self.n_states, n_stored), env=self.model._vec_normalize_env)
@@ -70,7 +74,7 @@ def _pca_figure(z: th.Tensor, values: th.Tensor) -> Figure:
     :param z: (B, n) embeddings
     :param values: (B, 1)
     """
-    centred = (z - z.mean(dim=0)).double().cpu()
+    centred = (z - z.mean(dim=0)).cpu().double()
     _, singular, directions = th.linalg.svd(centred, full_matrices=False)
     plane = centred @ directions[:2].T
     share = singular.square() / singular.square().sum().clamp(min=1e-30)

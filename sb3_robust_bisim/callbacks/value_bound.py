@@ -36,10 +36,8 @@ class ValueBoundCallback(EnvironmentCallback):
     """
 
     def _prepare(self) -> None:
-        try:
-            from sb3_robust_bisim.bounds import value_difference_bound
-        except ImportError as error:
-            raise ImportError('ValueBoundCallback needs pip install "sb3_robust_bisim[theory]".') from error
+        from sb3_robust_bisim.bounds import value_difference_bound  # the one callback that needs the extra
+
         self._bound = value_difference_bound
         if self.model.c_r == 0 or self.model.gamma == 1:
             raise ValueError(f"c_r={self.model.c_r}, gamma={self.model.gamma}: a bound on values needs c_r > 0 and gamma < 1.")
@@ -50,7 +48,7 @@ class ValueBoundCallback(EnvironmentCallback):
         keep = np.linspace(0, len(obs) - 1, self.n_states).astype(int)  # of all the episodes, the last one too
         z, _ = embed(self.model, self._tensor([obs[i] for i in keep]))
         first, second = np.triu_indices(len(keep), 1)
-        distance = pairwise_distance(z[first], z[second], self.model.distance).mean(dim=1).double().cpu().numpy()
+        distance = pairwise_distance(z[first], z[second], self.model.distance).mean(dim=1).cpu().double().numpy()
         gap = np.abs(returns[keep][first] - returns[keep][second])
         r_min, r_max = self.model.reward_range
         bound = self._bound(distance, self.model.c_r, self.model._c_t, self.model.gamma, r_max - r_min)

@@ -2,7 +2,7 @@
 
 import csv
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,22 @@ Result = dict[str, Any]
 Curve = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # steps, middle, low, high
 REPS, REPS_OF_CURVES = 1000, 200  # bootstrap samples
 MANY = 4  # runs from which on an interquartile mean leaves something out and an interval means something
+FEWEST = {"iqm_return": MANY}
 FULL = "normed-IR-ID"
+# A method looks the same in every figure: colour and dashes; what a figure adds of its own gets the colours that are left
+LOOKS = {
+    "SAC": ("C0", "-"),
+    "DBC": ("C1", "-"),
+    "DBC-normed": ("C2", "--"),  # dashes, as it may lie on SAC, or normed-IR on DBC-IR
+    "normed-IR": ("C3", "--"),
+    "normed-ID": ("C4", "-."),
+    FULL: ("C5", "-"),
+    "self-prediction": ("C6", "-"),
+    "self-prediction-IR": ("C7", "-"),
+    "DBC-IR": ("C8", "-"),
+    "DBC-alt": ("C9", "-"),
+}
+AS_WRITTEN = "-max0.1"  # another setting of the same method: thin
 
 
 def of(results: list[Result], **wanted: Any) -> list[Result]:
@@ -85,26 +100,45 @@ QUANTITIES: dict[str, tuple[Callable[[list[Result], str], Curve], str, str, str]
 }
 
 
+def styles(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """How each method is drawn."""
+    names = {method: method.removesuffix(AS_WRITTEN) for method in methods}
+    free = iter([look for name, look in LOOKS.items() if name not in names.values()])
+    looks = {name: LOOKS.get(name) or next(free) for name in dict.fromkeys(names.values())}
+    return {
+        method: {"color": looks[name][0], "linestyle": looks[name][1], "linewidth": 2.0 if method == name else 1.0}
+        for method, name in names.items()
+    }
+
+
 def draw(results: list[Result], figure: Figure, out: Path) -> None:
     """``curves.png`` and ``curves.csv``: one column of axes per task, one row per quantity."""
+    style = styles(figure.methods)
     panels = [panel for panel in figure.panels if of(results, panel=panel)]
-    picture = Picture(figsize=(1.5 + 4.2 * len(panels), 0.8 + 3.2 * len(figure.rows)), layout="constrained")
-    axes = picture.subplots(len(figure.rows), len(panels), squeeze=False, sharex=True)
+    most = max(len(of(results, panel=panel, method=method)) for panel in panels for method in figure.methods)
+    rows = [quantity for quantity in figure.rows if most >= FEWEST.get(quantity, 1)]
+    picture = Picture(figsize=(1.5 + 4.2 * len(panels), 0.8 + 3.2 * len(rows)), layout="constrained")
+    axes = picture.subplots(len(rows), len(panels), squeeze=False, sharex=True)
     table: list[list[Any]] = [["quantity", "panel", "method", "runs", "step", "middle", "low", "high"]]
-    for row, quantity in enumerate(figure.rows):
+    for row, quantity in enumerate(rows):
         for column, panel in enumerate(panels):
-            for color, method in enumerate(figure.methods):
-                if runs := of(results, panel=panel, method=method):
+            counts = []
+            for method in figure.methods:
+                runs = of(results, panel=panel, method=method)
+                if len(runs) >= FEWEST.get(quantity, 1):
+                    counts.append(len(runs))
                     curve, key, _, _ = QUANTITIES[quantity]
                     lines = curve(runs, key)
-                    # two methods that do the same lie on each other
-                    _draw_curve(axes[row, column], lines, method, f"C{color}", "-" if color // 3 % 2 == 0 else "--")
+                    _draw_curve(axes[row, column], lines, method, style[method])
                     if quantity == "mu_ratio":
                         target = np.nanmax(series(runs, "mu_ratio_target")[1])
-                        axes[row, column].axhline(target, color=f"C{color}", linestyle=":", linewidth=1)
+                        axes[row, column].axhline(target, color=style[method]["color"], linestyle=":", linewidth=1)
                     values = zip(*lines, strict=True)
                     table += [[quantity, panel, method, len(runs), *(f"{v:.6g}" for v in point)] for point in values]
-            _label(axes[row, column], quantity, panel if row == 0 else "", column == 0)
+            if counts:
+                _label(axes[row, column], quantity, f"{panel}, {_count(counts)}" if row == 0 else "", column == 0)
+            else:
+                axes[row, column].set_axis_off()  # too few runs
     for column in range(len(panels)):
         axes[-1, column].set_xlabel("environment steps")
         axes[-1, column].xaxis.set_major_locator(MaxNLocator(5))  # six digits each
@@ -116,10 +150,15 @@ def draw(results: list[Result], figure: Figure, out: Path) -> None:
         csv.writer(file).writerows(table)
 
 
-def _draw_curve(ax: Axes, curve: Curve, label: str, color: str, linestyle: str) -> None:
+def _draw_curve(ax: Axes, curve: Curve, label: str, style: dict[str, Any]) -> None:
     steps, middle, low, high = curve
-    ax.plot(steps, middle, label=label, color=color, linestyle=linestyle)
-    ax.fill_between(steps, low, high, color=color, alpha=0.2)
+    ax.plot(steps, middle, label=label, **style)
+    ax.fill_between(steps, low, high, color=style["color"], alpha=0.15, linewidth=0)
+
+
+def _count(runs: list[int]) -> str:
+    several = f"{min(runs)} to {max(runs)}" if min(runs) < max(runs) else f"{max(runs)}"
+    return f"{several} run{'s' if max(runs) > 1 else ''}"
 
 
 def _label(ax: Axes, quantity: str, title: str, first: bool) -> None:

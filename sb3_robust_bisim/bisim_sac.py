@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from sb3_robust_bisim import losses
 from sb3_robust_bisim.atomic import atomic_path
-from sb3_robust_bisim.checks import check_arguments, check_names, check_number_of_envs
+from sb3_robust_bisim.checks import check_arguments, check_names
 from sb3_robust_bisim.fast_paths import exact_onednn_matmul, unchecked_distributions
 from sb3_robust_bisim.intrinsic_reward import IntrinsicRewardVecEnv, with_intrinsic_reward
 from sb3_robust_bisim.latent_models import Dynamics
@@ -370,9 +370,10 @@ class BisimSAC(SAC):
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         env = self._wrap_env(env, self.verbose)
         check_for_correct_spaces(env, self.observation_space, self.action_space)
-        check_number_of_envs(env, self.n_envs)
         before = self.env
-        super().set_env(self._bind_intrinsic_reward(env), force_reset)
+        if env.num_envs == self.n_envs:  # SB3 refuses any other number, and then nothing shall be bound
+            env = self._bind_intrinsic_reward(env)
+        super().set_env(env, force_reset)
         if before is not None and before is not self.env:  # nobody learns from the old one's bonus any more
             old = unwrap_vec_wrapper(before, IntrinsicRewardVecEnv)
             if old is not None and old is not unwrap_vec_wrapper(self.env, IntrinsicRewardVecEnv):  # type: ignore[arg-type]

@@ -10,7 +10,6 @@ from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac.sac import SAC
 
 from sb3_robust_bisim.latent_models import DYNAMICS
@@ -107,15 +106,6 @@ def check_names(algorithm: type, kwargs: dict[str, Any]) -> None:
     for name in kwargs:
         if name not in known:
             raise TypeError(f"BisimSAC has no argument {name!r} (value {kwargs[name]!r}){closest(name, known)}")
-
-
-def check_number_of_envs(env: VecEnv, n_envs: int) -> None:
-    """What SB3's ``set_env`` asserts, before the bonus is bound to an environment that is then refused."""
-    if env.num_envs != n_envs:
-        raise ValueError(
-            f"env with num_envs={env.num_envs}: the model has {n_envs}. Pass as many, or BisimSAC.load(path, env=env), which "
-            "takes any number."
-        )
 
 
 def closest(name: str, known: Iterable[str]) -> str:

@@ -162,7 +162,7 @@ def test_a_bonus_below_a_frame_stack_is_refused(policy: str, env: Callable[[], g
 
 def test_another_number_of_environments_is_refused_and_stays_unbound() -> None:
     model, other = make_model(intrinsic_reward_scale=1.0), IntrinsicRewardVecEnv(DummyVecEnv([pendulum, pendulum]))
-    with pytest.raises(ValueError, match=r"num_envs=2: the model has 1\..*BisimSAC.load"):
+    with pytest.raises(AssertionError, match="number of environments"):
         model.set_env(other)
     assert other._bonus is None
 

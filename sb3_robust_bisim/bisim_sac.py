@@ -20,6 +20,7 @@ from sb3_robust_bisim.atomic import atomic_path
 from sb3_robust_bisim.checks import check_arguments, check_names
 from sb3_robust_bisim.fast_paths import exact_onednn_matmul, unchecked_distributions
 from sb3_robust_bisim.intrinsic_reward import IntrinsicRewardVecEnv, with_intrinsic_reward
+from sb3_robust_bisim.last_embedding import LastEmbedding
 from sb3_robust_bisim.latent_models import Dynamics
 from sb3_robust_bisim.losses import Distance
 from sb3_robust_bisim.policies import BisimActor, BisimCritic, BisimPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
@@ -124,8 +125,7 @@ class BisimSAC(SAC):
         self.policy_delay = policy_delay
         self.initial_gradient_steps = initial_gradient_steps
         self.bf16 = bf16
-        # The last observation that was embedded while collecting, its embedding, and `_n_updates` at that time
-        self._embedded: tuple[Any, th.Tensor, int] | None = None
+        self._last_embedding = LastEmbedding()
 
         if _init_setup_model:
             self._setup_model()
@@ -339,12 +339,10 @@ class BisimSAC(SAC):
         :param known: whether ``obs`` may have been embedded before
         :return: (n_envs, n)
         """
-        if known and self._embedded is not None:
-            embedded, z, n_updates = self._embedded
-            if n_updates == self._n_updates and _is_same(obs, embedded):
-                return z
-        z = self.critic.encode(self.policy.obs_to_tensor(obs)[0])
-        self._embedded = obs, z, self._n_updates
+        z = self._last_embedding.find(obs, self._n_updates) if known else None
+        if z is None:
+            z = self.critic.encode(self.policy.obs_to_tensor(obs)[0])
+            self._last_embedding.keep(obs, z, self._n_updates)
         return z
 
     def _sample_action(
@@ -411,7 +409,7 @@ class BisimSAC(SAC):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfBisimSAC:
-        self._embedded = None  # weights or environment may have been replaced since
+        self._last_embedding.forget()  # weights or environment may have been replaced since
         return super().learn(
             total_timesteps=total_timesteps,
             callback=callback,
@@ -441,26 +439,11 @@ class BisimSAC(SAC):
             super().save_replay_buffer(temporary)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_embedded"]
+        return [*super()._excluded_save_params(), "_last_embedding"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()
         return [*state_dicts, "policy.inverse_dynamics.optimizer"], tensors
-
-
-def _is_same(obs: Any, other: Any) -> bool:
-    """Whether both are one observation: one object, or one the channels-first view of the other (VecTransposeImage)."""
-    if obs is other:
-        return True
-    return _is_channels_first_view(obs, other) or _is_channels_first_view(other, obs)
-
-
-def _is_channels_first_view(view: Any, images: Any) -> bool:
-    if not (isinstance(view, np.ndarray) and isinstance(images, np.ndarray) and view.ndim == images.ndim == 4):
-        return False
-    expected = images.transpose(0, 3, 1, 2)
-    same_layout = (view.shape, view.strides) == (expected.shape, expected.strides)
-    return same_layout and view.ctypes.data == expected.ctypes.data
 
 
 def _embedding_statistics(z: th.Tensor, radius: float | None) -> dict[str, th.Tensor]:

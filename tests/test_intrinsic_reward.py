@@ -292,7 +292,7 @@ def test_what_the_bonus_keeps_is_not_saved(tmp_path: Any) -> None:
     model = BisimSAC("MlpPolicy", ENV, intrinsic_reward_scale=1.0, **SMALL).learn(12)
     model.save(tmp_path / "m")
     with zipfile.ZipFile(tmp_path / "m.zip") as archive:
-        assert "_embedded" not in json.loads(archive.read("data"))
+        assert "_last_embedding" not in json.loads(archive.read("data"))
     assert BisimSAC.load(tmp_path / "m").predict(np.zeros(3, np.float32))[0].shape == (1,)
 
 

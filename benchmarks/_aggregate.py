@@ -121,6 +121,7 @@ def draw(results: list[Result], figure: Figure, out: Path) -> None:
     axes = picture.subplots(len(rows), len(panels), squeeze=False, sharex=True)
     table: list[list[Any]] = [["quantity", "panel", "method", "runs", "step", "middle", "low", "high"]]
     for row, quantity in enumerate(rows):
+        first = True
         for column, panel in enumerate(panels):
             counts = []
             for method in figure.methods:
@@ -136,7 +137,8 @@ def draw(results: list[Result], figure: Figure, out: Path) -> None:
                     values = zip(*lines, strict=True)
                     table += [[quantity, panel, method, len(runs), *(f"{v:.6g}" for v in point)] for point in values]
             if counts:
-                _label(axes[row, column], quantity, f"{panel}, {_count(counts)}" if row == 0 else "", column == 0)
+                _label(axes[row, column], quantity, f"{panel}, {_count(counts)}" if row == 0 else "", first)
+                first = False
             else:
                 axes[row, column].set_axis_off()  # too few runs
     for column in range(len(panels)):

@@ -1,7 +1,6 @@
 """Curves and tables of a figure: mean and standard error as in the paper, and rliable's interquartile mean with intervals."""
 
 import csv
-import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,6 @@ from matplotlib.ticker import MaxNLocator
 from rliable import library, metrics
 
 from sb3_robust_bisim.atomic import atomic_path
-
-# arch, which draws rliable's samples, does not like the kind of generator that rliable gives it
-warnings.filterwarnings("ignore", "random_state is deprecated", FutureWarning)
 
 Result = dict[str, Any]
 Curve = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # steps, middle, low, high
@@ -64,6 +60,12 @@ def mean_curve(runs: list[Result], key: str) -> Curve:
     return steps, middle, middle - error, middle + error
 
 
+def estimate(scores: dict[str, Any], statistic: Callable[..., np.ndarray], reps: int) -> tuple[dict, dict]:
+    """rliable's estimates and intervals, the same each time: it samples from NumPy's global generator alone."""
+    np.random.seed(0)  # noqa: NPY002
+    return library.get_interval_estimates(scores, statistic, reps=reps)
+
+
 def iqm_curve(runs: list[Result], key: str) -> Curve:
     steps, values = series(runs, key)
     scores = {"": values[:, None, :]}  # runs, tasks, evaluations
@@ -71,7 +73,7 @@ def iqm_curve(runs: list[Result], key: str) -> Curve:
     def iqm(x: np.ndarray) -> np.ndarray:
         return np.array([metrics.aggregate_iqm(x[..., i]) for i in range(x.shape[-1])])
 
-    middle, intervals = library.get_interval_estimates(scores, iqm, reps=REPS_OF_CURVES, random_state=np.random.RandomState(0))
+    middle, intervals = estimate(scores, iqm, REPS_OF_CURVES)
     return steps, middle[""], *intervals[""]
 
 
@@ -115,32 +117,20 @@ def draw(results: list[Result], figure: Figure, out: Path) -> None:
     """``curves.png`` and ``curves.csv``: one column of axes per task, one row per quantity."""
     style = styles(figure.methods)
     panels = [panel for panel in figure.panels if of(results, panel=panel)]
-    most = max(len(of(results, panel=panel, method=method)) for panel in panels for method in figure.methods)
-    rows = [quantity for quantity in figure.rows if most >= FEWEST.get(quantity, 1)]
+    shown = {quantity: {panel: _enough(results, figure, panel, quantity) for panel in panels} for quantity in figure.rows}
+    rows = [quantity for quantity in figure.rows if any(shown[quantity].values())]
     picture = Picture(figsize=(1.5 + 4.2 * len(panels), 0.8 + 3.2 * len(rows)), layout="constrained")
     axes = picture.subplots(len(rows), len(panels), squeeze=False, sharex=True)
     table: list[list[Any]] = [["quantity", "panel", "method", "runs", "step", "middle", "low", "high"]]
     for row, quantity in enumerate(rows):
-        first = True
-        for column, panel in enumerate(panels):
-            counts = []
-            for method in figure.methods:
-                runs = of(results, panel=panel, method=method)
-                if len(runs) >= FEWEST.get(quantity, 1):
-                    counts.append(len(runs))
-                    curve, key, _, _ = QUANTITIES[quantity]
-                    lines = curve(runs, key)
-                    _draw_curve(axes[row, column], lines, method, style[method])
-                    if quantity == "mu_ratio":
-                        target = np.nanmax(series(runs, "mu_ratio_target")[1])
-                        axes[row, column].axhline(target, color=style[method]["color"], linestyle=":", linewidth=1)
-                    values = zip(*lines, strict=True)
-                    table += [[quantity, panel, method, len(runs), *(f"{v:.6g}" for v in point)] for point in values]
-            if counts:
-                _label(axes[row, column], quantity, f"{panel}, {_count(counts)}" if row == 0 else "", first)
-                first = False
-            else:
-                axes[row, column].set_axis_off()  # too few runs
+        leftmost = next(panel for panel in panels if shown[quantity][panel])
+        for ax, panel in zip(axes[row], panels, strict=True):
+            methods = shown[quantity][panel]
+            if not methods:
+                ax.set_axis_off()
+                continue
+            table += _draw_panel(ax, quantity, panel, methods, style)
+            _label(ax, quantity, f"{panel}, {_count(methods)}" if row == 0 else "", panel == leftmost)
     for column in range(len(panels)):
         axes[-1, column].set_xlabel("environment steps")
         axes[-1, column].xaxis.set_major_locator(MaxNLocator(5))  # six digits each
@@ -152,15 +142,38 @@ def draw(results: list[Result], figure: Figure, out: Path) -> None:
         csv.writer(file).writerows(table)
 
 
+def _enough(results: list[Result], figure: Figure, panel: str, quantity: str) -> dict[str, list[Result]]:
+    """The runs of each method that has as many as the quantity takes."""
+    runs = {method: of(results, panel=panel, method=method) for method in figure.methods}
+    return {method: found for method, found in runs.items() if len(found) >= FEWEST.get(quantity, 1)}
+
+
+def _draw_panel(
+    ax: Axes, quantity: str, panel: str, methods: dict[str, list[Result]], style: dict[str, dict[str, Any]]
+) -> list[list[Any]]:
+    """:return: what is drawn, as rows of ``curves.csv``"""
+    curve, key, _, _ = QUANTITIES[quantity]
+    table: list[list[Any]] = []
+    for method, runs in methods.items():
+        lines = curve(runs, key)
+        _draw_curve(ax, lines, method, style[method])
+        if quantity == "mu_ratio":
+            target = np.nanmax(series(runs, "mu_ratio_target")[1])
+            ax.axhline(target, color=style[method]["color"], linestyle=":", linewidth=1)
+        values = zip(*lines, strict=True)
+        table += [[quantity, panel, method, len(runs), *(f"{v:.6g}" for v in point)] for point in values]
+    return table
+
+
 def _draw_curve(ax: Axes, curve: Curve, label: str, style: dict[str, Any]) -> None:
     steps, middle, low, high = curve
     ax.plot(steps, middle, label=label, **style)
     ax.fill_between(steps, low, high, color=style["color"], alpha=0.15, linewidth=0)
 
 
-def _count(runs: list[int]) -> str:
-    several = f"{min(runs)} to {max(runs)}" if min(runs) < max(runs) else f"{max(runs)}"
-    return f"{several} run{'s' if max(runs) > 1 else ''}"
+def _count(methods: dict[str, list[Result]]) -> str:
+    fewest, most = min(map(len, methods.values())), max(map(len, methods.values()))
+    return f"{most if fewest == most else f'{fewest} to {most}'} run{'s' if most > 1 else ''}"
 
 
 def _label(ax: Axes, quantity: str, title: str, first: bool) -> None:
@@ -213,11 +226,7 @@ def tables(results: list[Result], figure: Figure, out: Path) -> dict[str, Any]:
 
 
 def _ending(runs: list[Result], final: np.ndarray, full: np.ndarray | None) -> dict[str, Any]:
-    estimate = library.get_interval_estimates
-    generator = np.random.RandomState(0)
-    iqm, interval = estimate(
-        {"": final[:, None]}, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=REPS, random_state=generator
-    )
+    iqm, interval = estimate({"": final[:, None]}, lambda x: np.array([metrics.aggregate_iqm(x)]), REPS)
     row: dict[str, Any] = {
         "runs": len(final),
         "mean": _short(final.mean()),
@@ -230,7 +239,7 @@ def _ending(runs: list[Result], final: np.ndarray, full: np.ndarray | None) -> d
     }
     if full is not None and min(len(full), len(final)) >= MANY:
         pair = {"": (full[:, None], final[:, None])}
-        better, interval = estimate(pair, metrics.probability_of_improvement, reps=REPS, random_state=generator)
+        better, interval = estimate(pair, metrics.probability_of_improvement, REPS)
         row["full_is_better"] = [_short(value) for value in (better[""], *np.ravel(interval[""]))]
     played = [run["final_return_by_split"] for run in runs if "final_return_by_split" in run]  # those that did not break off
     for split in played[0] if played else ():

@@ -57,6 +57,11 @@ HYPERPARAMS_SAMPLER[ALGO] = sample_bisim_sac_params
 HYPERPARAMS_CONVERTER[ALGO] = convert_offpolicy_params
 
 
+def is_yaml(config: str | Path) -> bool:
+    """The zoo takes a Python module as well, which it imports."""
+    return Path(config).suffix in (".yml", ".yaml")
+
+
 def variant_settings(config: str | Path, env_id: str, *names: str) -> dict[str, Any]:
     """
     The settings that named variants of a config file lay over the entry of a task, the last one on top.
@@ -66,7 +71,7 @@ def variant_settings(config: str | Path, env_id: str, *names: str) -> dict[str, 
     :param names: variants, ("DBC",) or ("SAC", "clean", "small") for example
     :raises ValueError: if the file knows no such variant
     """
-    if not str(config).endswith((".yml", ".yaml")):
+    if not is_yaml(config):
         raise ValueError(f"-conf {config}: --variant needs a YAML file.")
     content = yaml.safe_load(Path(config).read_text())
     general, own = content.get("variants", {}), content.get(env_id, {}).get("variants", {})
@@ -100,7 +105,7 @@ def check_task(env_id: str, config: str) -> None:
     :param config: file of hyperparameters; only a YAML file can be looked into
     :raises ValueError: naming the tasks that have one
     """
-    if not config.endswith((".yml", ".yaml")):
+    if not is_yaml(config):
         return
     tasks = [key for key in yaml.safe_load(Path(config).read_text()) if key != "variants"]
     if env_id not in tasks:
@@ -225,10 +230,10 @@ class BisimExperimentManager(ExperimentManager):
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         super().save_trained_model(model)
         title = f"{self.env_name} {' '.join(self.variants) or self.algo}"
-        if self.checkpoint is not None and model.num_timesteps >= self.n_timesteps:
+        if model.num_timesteps < self.n_timesteps:
+            print(f"Stopped at step {model.num_timesteps} of {self.n_timesteps}.")
+        elif self.checkpoint is not None:
             self.checkpoint.unlink(missing_ok=True)  # nothing is left to go on with
-        if model.num_timesteps < model._total_timesteps:
-            print(f"Stopped at step {model.num_timesteps} of {model._total_timesteps}.")
         report(Path(self.save_path), title, -1 if self.continue_training else getattr(model, "learning_starts", -1))
         if self.algo == ALGO and is_image_space(model.observation_space):
             self._record(model)
@@ -381,7 +386,7 @@ def _train_arguments(arguments: list[str]) -> list[str]:
     config = ours.conf_file or (str(DEFAULT_CONFIG) if ours.algo == ALGO and DEFAULT_CONFIG.is_file() else None)
     if ours.algo == ALGO and config is None and not {"-h", "--help"} & set(arguments):
         parser.error(f"-conf is needed: {DEFAULT_CONFIG} is not in this folder.")
-    if config is not None and config.endswith((".yml", ".yaml")) and not Path(config).is_file():
+    if config is not None and is_yaml(config) and not Path(config).is_file():
         parser.error(f"-conf {config}: there is no such file.")
     seed = [] if ours.seed is None else ["--seed", str(ours.seed)]
     return ["--algo", ours.algo, *(["-conf", config] if config else []), *seed, *theirs]

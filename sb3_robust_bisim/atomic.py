@@ -1,5 +1,6 @@
 """Files that appear whole or not at all."""
 
+import io
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,3 +22,18 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_save(path: str | os.PathLike[str] | io.BufferedIOBase, suffix: str) -> Iterator[Path | io.BufferedIOBase]:
+    """
+    ``atomic_path`` for what SB3's ``save`` methods take.
+
+    :param path: a stream is handed on as it is
+    :param suffix: what SB3 adds to a path that has none, ".zip" for example
+    """
+    if not isinstance(path, (str, os.PathLike)):
+        yield path
+        return
+    with atomic_path(path if Path(path).suffix else f"{path}{suffix}") as temporary:
+        yield temporary

@@ -1,5 +1,4 @@
 import io
-import os
 import pathlib
 from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar
@@ -16,7 +15,7 @@ from stable_baselines3.sac.sac import SAC
 from torch.nn import functional as F
 
 from sb3_robust_bisim import losses
-from sb3_robust_bisim.atomic import atomic_path
+from sb3_robust_bisim.atomic import atomic_save
 from sb3_robust_bisim.checks import check_arguments, check_names
 from sb3_robust_bisim.fast_paths import exact_onednn_matmul, unchecked_distributions
 from sb3_robust_bisim.intrinsic_reward import IntrinsicRewardVecEnv, with_intrinsic_reward
@@ -24,6 +23,7 @@ from sb3_robust_bisim.last_embedding import LastEmbedding
 from sb3_robust_bisim.latent_models import Dynamics
 from sb3_robust_bisim.losses import Distance
 from sb3_robust_bisim.policies import BisimActor, BisimCritic, BisimPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_robust_bisim.update_log import UpdateLog, embedding_statistics
 
 SelfBisimSAC = TypeVar("SelfBisimSAC", bound="BisimSAC")
 
@@ -173,8 +173,7 @@ class BisimSAC(SAC):
             gradient_steps = max(gradient_steps, self.initial_gradient_steps)
         inverse_dynamics = self.policy.inverse_dynamics
         actor_parameters = self.policy.actor_parameters()
-        # Everything to be logged stays on the device until the end of the call
-        scalars: dict[str, list[tuple[int, th.Tensor]]] = {}
+        log = UpdateLog()
 
         for _ in range(gradient_steps):
             self._n_updates += 1
@@ -247,12 +246,11 @@ class BisimSAC(SAC):
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
             step["train/ent_coef"] = ent_coef
-            for name, value in step.items():
-                scalars.setdefault(name, []).append((self._n_updates, value.detach().reshape(())))
+            log.add(self._n_updates, step)
 
         if gradient_steps > 0:
-            statistics = _embedding_statistics(z.detach(), self.radius)
-            self._record({**scalars, **{name: [(self._n_updates, value)] for name, value in statistics.items()}})
+            log.add(self._n_updates, embedding_statistics(z.detach(), self.radius))
+            self._record(log.means())
 
     def _representation_losses(
         self, z: th.Tensor, next_z: th.Tensor, actions: th.Tensor, rewards: th.Tensor
@@ -287,26 +285,9 @@ class BisimSAC(SAC):
             total = total + self.inverse_dynamics_coef * values["train/inverse_dynamics_loss"]
         return total, values
 
-    def _record(self, scalars: dict[str, list[tuple[int, th.Tensor]]]) -> None:
-        """
-        Bring the call's numbers to the CPU, in one transfer, and log their means.
-
-        :param scalars: for each TensorBoard key the numbers of the updates that gave a value, and the values
-        :raises ValueError: if one of them is not finite
-        """
-        values = iter(th.stack([value for steps in scalars.values() for _, value in steps]).cpu().tolist())
-        numbers = {name: [(update, next(values)) for update, _ in steps] for name, steps in scalars.items()}
-        broken = [
-            (update, name, value) for name, steps in numbers.items() for update, value in steps if not np.isfinite(value)
-        ]
-        if broken:
-            update, name, value = min(broken, key=lambda entry: entry[0])  # later ones follow from it
-            raise ValueError(
-                f"{name} became {value} at update {update}: training has stopped. Load the last checkpoint, and lower "
-                "learning_rate, set norm_constraint=True or check the range of observations and rewards."
-            )
+    def _record(self, means: dict[str, float]) -> None:
+        """:param means: by TensorBoard key, over the updates of one call"""
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        means = {name: float(np.mean([value for _, value in steps])) for name, steps in numbers.items()}
         for name, mean in means.items():
             self.logger.record(name, mean)
         if self.bisim_coef > 0:
@@ -426,17 +407,13 @@ class BisimSAC(SAC):
         include: Iterable[str] | None = None,
     ) -> None:
         """Like SB3's ``save``; a file that existed before stays whole until the new one is."""
-        if not isinstance(path, (str, os.PathLike)):
-            return super().save(path, exclude, include)
-        with atomic_path(path if pathlib.Path(path).suffix else f"{path}.zip") as temporary:
-            super().save(temporary, exclude, include)
+        with atomic_save(path, ".zip") as whole:
+            super().save(whole, exclude, include)
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Like SB3's ``save_replay_buffer``; a file that existed before stays whole until the new one is."""
-        if not isinstance(path, (str, os.PathLike)):
-            return super().save_replay_buffer(path)
-        with atomic_path(path if pathlib.Path(path).suffix else f"{path}.pkl") as temporary:
-            super().save_replay_buffer(temporary)
+        with atomic_save(path, ".pkl") as whole:
+            super().save_replay_buffer(whole)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_last_embedding"]
@@ -444,20 +421,3 @@ class BisimSAC(SAC):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()
         return [*state_dicts, "policy.inverse_dynamics.optimizer"], tensors
-
-
-def _embedding_statistics(z: th.Tensor, radius: float | None) -> dict[str, th.Tensor]:
-    """
-    What tells a collapse (std and norm near 0) from an explosion (norm without bound) or a ball that is too small.
-
-    :param z: (B, n)
-    """
-    norm = z.norm(dim=1)
-    statistics = {
-        "bisim/embedding_norm_mean": norm.mean(),
-        "bisim/embedding_norm_max": norm.max(),
-        "bisim/embedding_std": z.std(dim=0, unbiased=False).mean(),
-    }
-    if radius is not None:
-        statistics["bisim/clamp_fraction"] = losses.on_surface(norm, radius).float().mean()
-    return statistics

@@ -167,7 +167,7 @@ def train(command: list[str], folder: Path, result_path: Path, identity: dict, c
     from filelock import FileLock
 
     folder.mkdir(parents=True, exist_ok=True)
-    with FileLock(folder.with_suffix(".lock")):  # a scheduler may take a worker for dead that is not
+    with FileLock(folder.with_name(f"{folder.name}.lock")):  # a scheduler may take a worker for dead that is not
         if result := finished(result_path, identity):
             return result
         try:

@@ -2,21 +2,25 @@
 
 import io
 import os
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 
 @contextmanager
-def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_path(path: str | os.PathLike[str], alone: bool = False) -> Iterator[Path]:
     """
     A temporary path beside ``path``, renamed to it when the block ends well and removed when it does not.
 
     :param path: where the file shall be; missing parent folders are created
+    :param alone: nobody else writes this file: the temporary one always has the same name, so that what a kill has left is
+        written over and does not pile up
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{target.stem}.{os.getpid()}.tmp{target.suffix}")  # writers choose formats by suffix
+    writer = "" if alone else f".{uuid.uuid4().hex}"  # process ids repeat, between threads and between machines
+    temporary = target.with_name(f".{target.stem}{writer}.tmp{target.suffix}")  # writers choose formats by suffix
     try:
         yield temporary
         os.replace(temporary, target)

@@ -186,7 +186,7 @@ class BisimSAC(SAC):
             if self.use_sde:
                 self.actor.reset_noise()
 
-            # The only place where the batch is encoded, but for the target encoder
+            # The only place where the batch is encoded, but for the target encoder and an encoder that the actor owns
             z = self.critic.embed(obs)
             with th.set_grad_enabled(self.inverse_dynamics_coef > 0):
                 next_z = self.critic.embed(next_obs)
@@ -391,6 +391,8 @@ class BisimSAC(SAC):
         progress_bar: bool = False,
     ) -> SelfBisimSAC:
         self._last_embedding.forget()  # weights or environment may have been replaced since
+        if self.env is not None:  # another model on the same environments may have bound its own bonus
+            self.env = self._bind_intrinsic_reward(self.env)
         return super().learn(
             total_timesteps=total_timesteps,
             callback=callback,

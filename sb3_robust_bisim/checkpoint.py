@@ -2,7 +2,8 @@
 Checkpoints from which training goes on as if it had never stopped.
 
 SB3's own ``save`` keeps the agent. Here everything goes into one file that the next number depends on: agent and optimizers,
-replay buffer, environments in the middle of their episodes, callbacks with what they have gathered, and the random generators.
+replay buffer, environments in the middle of their episodes, callbacks with what they have gathered, and the random generators
+(of CPU and CUDA).
 Learning then gives the same numbers, bit by bit, as a run that was never interrupted. What differs: the wall-clock times;
 the first line of every output of SB3's logger, whose means begin anew; and with ``use_sde`` or action noise the exploration,
 whose noise SB3 draws anew whenever ``learn`` is called.
@@ -17,8 +18,11 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import cloudpickle
+import gymnasium as gym
 import numpy as np
 import torch as th
+from gymnasium.utils import EzPickle
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.logger import Logger
@@ -36,7 +40,8 @@ class Checkpoint(BaseCallback):
     :param every: environment steps between two checkpoints, all environments together, >= 1
     :param context: anything else to keep, under the same roof: objects shared with the model stay shared
     :param about: plain values that :func:`read_about` finds without unpickling anything else
-    :raises ValueError: for ``every`` < 1; at the start of training, for environments in processes of their own
+    :raises ValueError: for ``every`` < 1; at the start of training, for environments that cannot be kept (see
+        :func:`save_checkpoint`)
     """
 
     def __init__(self, path: str | Path, every: int, context: Any = None, about: dict[str, Any] | None = None) -> None:
@@ -50,8 +55,7 @@ class Checkpoint(BaseCallback):
         self._last = 0
 
     def _on_training_start(self) -> None:
-        if isinstance(self.training_env.unwrapped, SubprocVecEnv):
-            raise ValueError("SubprocVecEnv keeps its environments in other processes: use DummyVecEnv (--vec-env dummy).")
+        _check_environments(self.model)
         self._last = self.num_timesteps
 
     def _on_rollout_start(self) -> None:
@@ -65,12 +69,17 @@ class Checkpoint(BaseCallback):
 
 def save_checkpoint(path: str | Path, model: BaseAlgorithm, context: Any = None, about: dict[str, Any] | None = None) -> None:
     """
-    :param path: file to write; an old one stays whole until the new one is
+    Keep everything that the next number depends on.
+
+    :param path: file to write; an old one stays whole until the new one is. Nobody else may write it
     :param model: between two calls of ``collect_rollouts``, as in :class:`Checkpoint`
     :param context: anything else to keep
     :param about: plain values for :func:`read_about`
+    :raises ValueError: for environments in processes of their own, and for those that Gymnasium pickles as the arguments of
+        their constructor (``EzPickle``: its MuJoCo and Box2D tasks, Shimmy's): they would begin anew
     """
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
+    _check_environments(model)
+    with atomic_path(path, alone=True) as temporary, temporary.open("wb") as file:
         gpus = th.cuda.device_count() if model.device.type == "cuda" else 0
         header = {"num_timesteps": model.num_timesteps, "versions": _versions(), "gpus": gpus}
         pickle.dump({**(about or {}), **header}, file)
@@ -106,12 +115,35 @@ def load_checkpoint(path: str | Path) -> tuple[Any, Any]:
             raise ValueError(f"{path}: written with {about['gpus']} GPUs, here are {th.cuda.device_count()}; go on there.")
         model, context, (python, numpy, torch, cuda) = cloudpickle.load(file)
     model._custom_logger = False  # so that learn() makes one
+    if isinstance(model.replay_buffer, HerReplayBuffer):  # does not pickle its environment
+        model.replay_buffer.set_env(model.env)
     random.setstate(python)
     np.random.set_state(numpy)  # noqa: NPY002 (SB3 samples with it)
     th.set_rng_state(torch)
     if cuda:
         th.cuda.set_rng_state_all(cuda)
     return model, context
+
+
+def _check_environments(model: BaseAlgorithm) -> None:
+    assert model.env is not None
+    venv = model.env.unwrapped
+    if isinstance(venv, SubprocVecEnv):
+        raise ValueError("SubprocVecEnv keeps its environments in other processes: use DummyVecEnv (--vec-env dummy).")
+    for env in getattr(venv, "envs", []):
+        layer = env
+        while isinstance(layer, gym.Wrapper) and not _begins_anew(layer):
+            layer = layer.env
+        if _begins_anew(layer):
+            raise ValueError(
+                f"{type(layer).__name__} is pickled as the arguments of its constructor (EzPickle): after a checkpoint it "
+                "would begin anew in the middle of an episode. Train without checkpoints, or give it a __getstate__ that "
+                "keeps its state."
+            )
+
+
+def _begins_anew(env: gym.Env) -> bool:
+    return type(env).__getstate__ is EzPickle.__getstate__
 
 
 def _read_header(file: BinaryIO) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import is_image_space_channels_first
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
 
 try:
     import psutil
@@ -283,6 +283,12 @@ class FrameStackReplayBuffer(ReplayBuffer):
         start = 0
         for block in blocks:
             start += _unpack(block, self._frames[start:])
+
+
+def frames_per_observation(venv: VecEnv) -> int:
+    """How many frames a chain of wrappers stacks; 1 without a VecFrameStack."""
+    stack = unwrap_vec_wrapper(venv, VecFrameStack)
+    return 1 if stack is None else stack.stacked_obs.n_stack
 
 
 def _check_space(observation_space: spaces.Space, n_stack: int) -> bool:

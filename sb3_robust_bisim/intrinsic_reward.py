@@ -19,7 +19,8 @@ class IntrinsicRewardVecEnv(VecEnvWrapper):
     Until something is bound it passes everything through, so the same chain of wrappers serves training and evaluation.
     :class:`~sb3_robust_bisim.BisimSAC` binds itself, and puts this wrapper outermost if the chain has none. Put it in
     yourself below VecNormalize (off-policy algorithms ignore rewards changed outside of it) and above anything that
-    changes the shape of the observation, such as VecFrameStack.
+    changes the shape of the observation, such as VecFrameStack. Rewards that pass through it count the bonus: evaluate in
+    an environment of its own, or in one that has a Monitor inside.
 
     Example::
 
@@ -68,7 +69,9 @@ def _successors(obs: VecEnvObs, dones: np.ndarray, infos: list[dict[str, Any]]) 
         return obs
     obs = deepcopy(obs)
     for i in np.flatnonzero(dones):
-        terminal = infos[i]["terminal_observation"]
+        terminal = infos[i].get("terminal_observation")
+        if terminal is None:  # as SB3's replay buffers take it: some VecEnvs of others do not tell
+            continue
         if isinstance(obs, dict):
             for key in obs:
                 obs[key][i] = terminal[key]

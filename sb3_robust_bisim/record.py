@@ -9,6 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_robust_bisim.atomic import atomic_path
+from sb3_robust_bisim.frame_buffer import frames_per_observation
 
 COLUMNS, ROWS = 8, 4
 MAX_FRAMES = 1000  # of a task whose episodes do not end
@@ -18,18 +19,19 @@ def record(model: BaseAlgorithm, venv: VecEnv, folder: Path) -> tuple[Path, Path
     """
     Play one episode without exploration.
 
-    :param model: acts on stacks of RGB frames
+    :param model: acts on stacks of RGB or grey frames
     :param venv: one environment with ``render_mode="rgb_array"``, in the agent's chain of wrappers
     :param folder: where ``agent.mp4`` and ``what_the_agent_sees.png`` are put
     :return: the two files
     """
     shown: list[np.ndarray | None] = []
     seen: list[np.ndarray] = []
+    n_stack = frames_per_observation(venv)
     done = False
     obs = venv.reset()
     while not done and len(shown) < MAX_FRAMES:
         shown.append(venv.render())
-        seen.append(_newest_frame(np.asarray(obs)[0]))
+        seen.append(_newest_frame(np.asarray(obs)[0], n_stack))
         action, _ = model.predict(obs, deterministic=True)  # type: ignore[arg-type]
         obs, _, dones, _ = venv.step(action)
         done = bool(dones[0])
@@ -50,8 +52,8 @@ def contact_sheet(frames: list[np.ndarray]) -> np.ndarray:
     return np.concatenate(rows)
 
 
-def _newest_frame(stack: np.ndarray) -> np.ndarray:
+def _newest_frame(stack: np.ndarray, n_stack: int) -> np.ndarray:
     """The last frame of a stack of either channel order, RGB or grey, as (H, W, 3)."""
     if stack.shape[0] < stack.shape[-1]:
         stack = stack.transpose(1, 2, 0)
-    return stack[..., -3:] if stack.shape[-1] % 3 == 0 else stack[..., -1:].repeat(3, axis=-1)
+    return stack[..., -3:] if stack.shape[-1] == 3 * n_stack else stack[..., -1:].repeat(3, axis=-1)

@@ -2,6 +2,7 @@
 
 Equation labels are those of Kemertas and Aumentado-Armstrong, "Towards Robust Bisimulation Metric Learning" (NeurIPS 2021).
 Needs the ``theory`` extra (SciPy and POT). The bounds built on these metrics are in :mod:`sb3_robust_bisim.bounds`.
+Arrays of a wrong shape, what is no distribution, and weights outside their ranges raise ValueError.
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ try:
     from scipy.sparse import csr_array
     from scipy.spatial.distance import pdist, squareform
 except ImportError as error:
-    raise ImportError(f'{error}: exact metrics and bounds need pip install "sb3_robust_bisim[theory]".') from error
+    raise ImportError(
+        f"{error}: exact metrics and bounds need the extra `theory`: pip install sb3_robust_bisim[theory]"
+    ) from error
 
 Array = NDArray[np.float64]
 

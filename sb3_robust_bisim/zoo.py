@@ -14,7 +14,7 @@ import rl_zoo3.enjoy
 import rl_zoo3.train
 import yaml
 from matplotlib.figure import Figure
-from rl_zoo3 import ALGOS
+from rl_zoo3 import ALGOS, exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, convert_offpolicy_params, sample_sac_params
 from rl_zoo3.utils import EnvironmentName, get_class_by_name
@@ -45,7 +45,7 @@ def sample_bisim_sac_params(
     """Optuna's search space: that of SAC, and the weights of metric, bonus and inverse dynamics where the method has them."""
     sampled = sample_sac_params(trial, n_actions, n_envs, additional_args)
     # SAC's sampler replaces all of policy_kwargs
-    sampled["policy_kwargs"] = {**BisimExperimentManager.tuned.get("policy_kwargs", {}), **sampled["policy_kwargs"]}
+    sampled["policy_kwargs"] = {**_policy_kwargs(BisimExperimentManager.tuned), **sampled["policy_kwargs"]}
     for name, low, high in WEIGHTS:
         if BisimExperimentManager.tuned.get(name, inspect.signature(BisimSAC).parameters[name].default) > 0:
             sampled[name] = trial.suggest_float(name, low, high, log=True)
@@ -55,6 +55,12 @@ def sample_bisim_sac_params(
 ALGOS[ALGO] = BisimSAC
 HYPERPARAMS_SAMPLER[ALGO] = sample_bisim_sac_params
 HYPERPARAMS_CONVERTER[ALGO] = convert_offpolicy_params
+
+
+def _policy_kwargs(settings: dict[str, Any]) -> dict[str, Any]:
+    """Those of an entry, which may be a Python expression, as in most of the zoo's own files."""
+    policy_kwargs = settings.get("policy_kwargs", {})
+    return eval(policy_kwargs, vars(exp_manager)) if isinstance(policy_kwargs, str) else policy_kwargs
 
 
 def is_yaml(config: str | Path) -> bool:
@@ -74,7 +80,7 @@ def variant_settings(config: str | Path, env_id: str, *names: str) -> dict[str, 
     if not is_yaml(config):
         raise ValueError(f"-conf {config}: --variant needs a YAML file.")
     content = yaml.safe_load(Path(config).read_text())
-    general, own = content.get("variants", {}), content.get(env_id, {}).get("variants", {})
+    general, own = content.get("variants") or {}, content.get(env_id, {}).get("variants") or {}
     settings: dict[str, Any] = {}
     for name in names:
         if name not in general and name not in own:
@@ -108,7 +114,7 @@ def check_task(env_id: str, config: str) -> None:
     if not is_yaml(config):
         return
     tasks = [key for key in yaml.safe_load(Path(config).read_text()) if key != "variants"]
-    if env_id not in tasks:
+    if env_id not in tasks and "default" not in tasks:  # the zoo's entry for any task
         raise ValueError(
             f"--env {env_id}: {config} has settings for {', '.join(tasks)}. Copy the entry of a task that is like yours, in "
             "this file or in one of your own, which -conf names."
@@ -132,14 +138,8 @@ class BisimExperimentManager(ExperimentManager):
         params = self.custom_hyperparams or {}
         if self.algo == ALGO:
             check_keys(params, "-params")
-        if self.continue_training and not self.variants:
-            # what the agent was trained with: `load` takes the entry's settings in place of the saved ones
-            arguments = Path(self.trained_agent).parent / self.env_name / "args.yml"
-            if arguments.is_file():
-                trained = yaml.unsafe_load(arguments.read_text())
-                BisimExperimentManager.variants = trained.get("variant", [])
-                params = {**(trained.get("hyperparams") or {}), **params}
-                self.args.hyperparams = params  # kept in the run's args.yml, for the next time
+        if self.continue_training:
+            params = self._restore_arguments(params)
         if self.algo == ALGO:
             check_task(self.env_name.gym_id, self.config)
         # entry < variants < Optuna's trial < -params
@@ -150,8 +150,8 @@ class BisimExperimentManager(ExperimentManager):
             check_keys(hyperparams, self.config)
         for settings in (hyperparams, saved_hyperparams):
             settings.pop("variants", None)
-        buffer_class = str(hyperparams.get("replay_buffer_class"))
-        if "." in buffer_class:  # the zoo evaluates the string where our classes are unknown
+        buffer_class = hyperparams.get("replay_buffer_class")
+        if isinstance(buffer_class, str) and "." in buffer_class:  # the zoo evaluates it where our classes are unknown
             hyperparams["replay_buffer_class"] = get_class_by_name(buffer_class)
         self.args.variant = self.variants  # kept in the run's args.yml
         env_kwargs = self.env_kwargs or hyperparams.get("env_kwargs", {})
@@ -160,14 +160,37 @@ class BisimExperimentManager(ExperimentManager):
         self.eval_env_kwargs = {**env_kwargs, **eval_kwargs, **(self._eval_env_kwargs_args or {})}
         return hyperparams, saved_hyperparams
 
+    def _restore_arguments(self, params: dict[str, Any]) -> dict[str, Any]:
+        """
+        What an agent was trained with, for ``load`` takes the entry's settings in place of the saved ones. It is kept in the
+        new run's args.yml, for the next time.
+
+        :param params: those of the command line, which go before
+        :return: ``params`` with the agent's below
+        """
+        arguments = Path(self.trained_agent).parent / self.env_name / "args.yml"
+        if not arguments.is_file():
+            return params
+        trained = yaml.unsafe_load(arguments.read_text())
+        if not self.env_kwargs:
+            self.args.env_kwargs = trained.get("env_kwargs")
+            self.env_kwargs = self.args.env_kwargs or {}
+        if self._eval_env_kwargs_args is None:
+            self.args.eval_env_kwargs = self._eval_env_kwargs_args = trained.get("eval_env_kwargs")
+        if not self.variants:
+            BisimExperimentManager.variants = trained.get("variant", [])
+            self.args.hyperparams = params = {**(trained.get("hyperparams") or {}), **params}
+        return params
+
     def _trial_settings(self, settings: dict[str, Any]) -> dict[str, Any]:
         """What Optuna found, if a trial was asked for, over the policy_kwargs that it was found with."""
         if self.algo != ALGO or not (self.storage and self.study_name and self.trial_id):
             return {}
+        if not is_yaml(self.config):
+            raise ValueError(f"-conf {self.config}: --trial-id needs a YAML file.")
         found = self.load_trial(self.storage, self.study_name, self.trial_id)
         entry = yaml.safe_load(Path(self.config).read_text()).get(self.env_name.gym_id, {})
-        policy_kwargs = {**entry, **settings}.get("policy_kwargs", {})
-        return {**found, "policy_kwargs": {**policy_kwargs, **found["policy_kwargs"]}}
+        return {**found, "policy_kwargs": {**_policy_kwargs({**entry, **settings}), **found["policy_kwargs"]}}
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         if self.checkpoint is None:
@@ -185,9 +208,12 @@ class BisimExperimentManager(ExperimentManager):
 
     def _settings(self, hyperparams: dict[str, Any]) -> dict[str, Any]:
         """What must be the same for a run to be continued; it may become longer."""
-        keys = ("eval_freq", "eval_episodes", "n_eval_envs", "save_freq", "eval_env_kwargs", "device")
+        keys = ("eval_freq", "eval_episodes", "n_eval_envs", "save_freq", "device")
         asked = {key: vars(self.args)[key] for key in keys}
-        env_kwargs = {"env_kwargs": self.env_kwargs or hyperparams.get("env_kwargs", {})}
+        env_kwargs = {
+            "env_kwargs": self.env_kwargs or hyperparams.get("env_kwargs", {}),
+            "eval_env_kwargs": self.eval_env_kwargs,
+        }
         seed = self.seed if self.seed_given else "random"  # the zoo draws one
         return {"env": str(self.env_name), "seed": seed, **hyperparams, **env_kwargs, **asked, "n_timesteps": None}
 
@@ -238,8 +264,8 @@ class BisimExperimentManager(ExperimentManager):
         if self.algo == ALGO and is_image_space(model.observation_space):
             self._record(model)
         print(f"Model:          {self.save_path}/{self.env_name}.zip")
-        if self.tensorboard_log:
-            print(f"TensorBoard:    tensorboard --logdir {self.tensorboard_log}")
+        if tensorboard_log := getattr(model, "tensorboard_log", None):  # of a run that went on: where it began
+            print(f"TensorBoard:    tensorboard --logdir {tensorboard_log}")
 
     def _record(self, model: BaseAlgorithm) -> None:
         try:
@@ -272,16 +298,17 @@ def report(run: Path, title: str, learning_starts: int) -> None:
         return
     with np.load(run / "evaluations.npz") as evaluations:
         steps, returns = evaluations["timesteps"], evaluations["results"]
-    mean, standard_error = returns.mean(axis=1), returns.std(axis=1) / np.sqrt(returns.shape[1])
+    episodes = returns.shape[1]
+    mean, standard_error = returns.mean(axis=1), returns.std(axis=1, ddof=min(1, episodes - 1)) / np.sqrt(episodes)
     figure = Figure(figsize=(6.4, 4.0), layout="constrained")
     axes = figure.subplots()
     axes.plot(steps, mean, marker=".")
     axes.fill_between(steps, mean - standard_error, mean + standard_error, alpha=0.25)
-    axes.set(title=title, xlabel="environment steps", ylabel=f"evaluation return, mean of {returns.shape[1]} episodes")
+    axes.set(title=title, xlabel="environment steps", ylabel=f"evaluation return, mean of {episodes} episodes")
     axes.grid(alpha=0.3)
     with atomic_path(run / "learning_curve.png") as temporary:
         figure.savefig(temporary, dpi=120, format="png")
-    print(f"Evaluation return, mean of {returns.shape[1]} episodes:")
+    print(f"Evaluation return, mean of {episodes} episodes:")
     print(f"  {'before training' if steps[0] <= learning_starts else 'at first'} (step {steps[0]}): {mean[0]:.1f}")
     best = int(mean.argmax())
     print(f"  best (step {steps[best]}): {mean[best]:.1f}, kept as {run / 'best_model.zip'}")
@@ -360,7 +387,7 @@ def _train_arguments(arguments: list[str]) -> list[str]:
         type=Path,
         metavar="FILE",
         help="keep everything that the next step depends on in this file; the same command goes on from it, exactly, after an "
-        "interruption (remove it to begin anew)",
+        "interruption (remove it to begin anew); where it logs and whether it shows a progress bar stay as they were",
     )
     parser.add_argument(
         "--checkpoint-freq", type=int, default=10_000, metavar="N", help="environment steps (default: %(default)s)"

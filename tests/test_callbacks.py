@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+import yaml
 from rl_zoo3.utils import get_callback_list
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -15,7 +16,7 @@ from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_robust_bisim import BisimSAC
+from sb3_robust_bisim import BisimSAC, zoo
 from sb3_robust_bisim.callbacks import DenoisingFactorCallback, EmbeddingCallback, ValueBoundCallback, diagnostic
 from sb3_robust_bisim.checkpoint import Checkpoint, load_checkpoint
 from sb3_robust_bisim.envs import NoiseObservation
@@ -52,6 +53,10 @@ class Picture(gym.Env):
         clean = np.full((8, 8, 3), 20 * self.t, np.uint8)
         noise = self.np_random.integers(0, self.noise + 1, (8, 8, 3), dtype=np.uint8)
         return clean + noise, {"clean_obs": clean} if self.clean_obs else {}
+
+
+class GreyEnv(Picture):
+    observation_space = gym.spaces.Box(0, 255, (8, 8, 1), np.uint8)
 
 
 gym.register("test/Picture-v0", Picture)  # type: ignore[arg-type]
@@ -159,6 +164,13 @@ def test_frames_become_sprites(tmp_path: Path) -> None:
     assert len((folder / "metadata.tsv").read_text().splitlines()) == 5
 
 
+def test_of_three_grey_frames_the_newest_becomes_a_grey_sprite() -> None:
+    callback = EmbeddingCallback()
+    callback.model = BisimSAC("CnnPolicy", VecFrameStack(DummyVecEnv([lambda: GreyEnv()]), 3), buffer_size=10)
+    stack = th.tensor([0, 100, 200], dtype=th.uint8).reshape(1, 3, 1, 1).expand(1, 3, 8, 8)
+    assert callback._sprites(stack).unique().tolist() == pytest.approx([200 / 255])
+
+
 @pytest.mark.parametrize(("where", "expected"), [(slice(0, 2), 1.0), (slice(-2, None), 0.0)])
 def test_the_denoising_factor_tells_states_from_noise(where: slice, expected: float, tmp_path: Path) -> None:
     model = learn(None, None, steps=1)
@@ -256,6 +268,25 @@ def test_a_zoo_yaml_can_name_them(tmp_path: Path) -> None:
 def test_what_cannot_work_is_refused_when_training_starts(callback: BaseCallback, env: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         learn(None, callback, steps=10**9, env=env)
+
+
+def test_the_zoo_shows_why_training_did_not_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    content = yaml.safe_load(zoo.DEFAULT_CONFIG.read_text())
+    content[NOISY] |= {"callback": "sb3_robust_bisim.callbacks.ValueBoundCallback", "c_r": 0.0, "norm_constraint": False}
+    (tmp_path / "config.yml").write_text(yaml.dump(content))
+    monkeypatch.setattr("sys.argv", ["sb3_robust_bisim"])
+    with pytest.raises(ValueError, match="c_r > 0"):
+        zoo.main(["train", "--env", NOISY, "-conf", str(tmp_path / "config.yml"), "-f", str(tmp_path), "--eval-freq", "-1"])
+
+
+def test_an_agent_that_has_broken_is_not_looked_at(tmp_path: Path) -> None:
+    callback = EmbeddingCallback(every=10**6)
+    model = learn(tmp_path, callback, steps=30)
+    with th.no_grad():
+        next(model.policy.parameters()).fill_(th.nan)
+    model.num_timesteps += 1
+    callback.on_training_end()  # as the zoo does after "training has stopped"
+    assert len(list(tmp_path.glob("BisimSAC_1/*/embedding/tensors.tsv"))) == 1
 
 
 def test_a_bound_needs_rewards_in_the_metric() -> None:

@@ -1,19 +1,26 @@
 """Training that goes on from a checkpoint ends exactly as training that was never interrupted."""
 
 import pickle
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch as th
+import yaml
 from small_models import SMALL
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack, VecNormalize
 
 from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer, IntrinsicRewardVecEnv, zoo
+from sb3_robust_bisim.atomic import atomic_path
 from sb3_robust_bisim.checkpoint import Checkpoint, load_checkpoint, read_about, save_checkpoint
 
 STEPS = 120
@@ -81,12 +88,66 @@ def test_a_monitor_file_has_each_episode_once(tmp_path: Path) -> None:
     assert episodes(tmp_path / "b") == episodes(tmp_path / "a")
 
 
-def test_a_checkpoint_of_environments_in_other_processes_is_refused_at_the_start(tmp_path: Path) -> None:
-    venv = make_vec_env("Pendulum-v1", 1, vec_env_cls=SubprocVecEnv)
+@pytest.mark.parametrize(
+    ("env", "venv_class", "message"),
+    [
+        ("Pendulum-v1", SubprocVecEnv, "use DummyVecEnv"),
+        (
+            "InvertedPendulum-v5",
+            DummyVecEnv,
+            r"InvertedPendulumEnv is pickled as the arguments of its constructor .* begin anew",
+        ),
+    ],
+)
+def test_environments_that_cannot_be_kept_are_refused_at_the_start(
+    env: str, venv_class: type[VecEnv], message: str, tmp_path: Path
+) -> None:
+    venv = make_vec_env(env, 1, vec_env_cls=venv_class)
     model = BisimSAC("MlpPolicy", venv, **LEARNING)
-    with pytest.raises(ValueError, match="use DummyVecEnv"):
-        model.learn(10, callback=Checkpoint(tmp_path / "checkpoint.pkl", 5))
+    with pytest.raises(ValueError, match=message):
+        model.learn(10**9, callback=Checkpoint(tmp_path / "checkpoint.pkl", 10**9))
+    with pytest.raises(ValueError, match=message):
+        save_checkpoint(tmp_path / "checkpoint.pkl", model)
+    assert not list(tmp_path.iterdir())
     venv.close()
+
+
+def test_hindsight_replay_goes_on_as_well(tmp_path: Path) -> None:
+    def model() -> BisimSAC:
+        env = BitFlippingEnv(n_bits=4, continuous=True)
+        settings = {**LEARNING, "intrinsic_reward_scale": 0.0, "replay_buffer_class": HerReplayBuffer}
+        return BisimSAC("MultiInputPolicy", env, **settings)
+
+    expected = model().learn(60)
+    model().learn(60, callback=CallbackList([Checkpoint(tmp_path / "checkpoint.pkl", 30), StopAt(40)]))
+    continued, _ = load_checkpoint(tmp_path / "checkpoint.pkl")
+    continued.learn(60 - continued.num_timesteps, reset_num_timesteps=False)
+    for name, tensor in expected.policy.state_dict().items():
+        assert th.equal(tensor, continued.policy.state_dict()[name]), name
+
+
+def test_what_a_kill_has_left_is_written_over(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.pkl"
+    script = f"""
+import os, signal
+from sb3_robust_bisim.atomic import atomic_path
+with atomic_path({str(path)!r}, alone=True) as temporary:
+    temporary.write_text("half a checkpoint")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    assert subprocess.run([sys.executable, "-c", script], timeout=300).returncode == -signal.SIGKILL
+    assert len(list(tmp_path.iterdir())) == 1
+    save_checkpoint(path, BisimSAC("MlpPolicy", "Pendulum-v1", **LEARNING))
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pkl"]
+    assert read_about(path)["num_timesteps"] == 0
+
+
+def test_two_writers_of_one_file_do_not_meet(tmp_path: Path) -> None:
+    with atomic_path(tmp_path / "clip.raw") as first, atomic_path(tmp_path / "clip.raw") as second:
+        first.write_text("first")
+        second.write_text("second")
+    assert (tmp_path / "clip.raw").read_text() == "first"  # the last one to end
+    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_a_checkpoint_needs_steps_in_between() -> None:
@@ -114,6 +175,7 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
         (["--seed=4"], r"seed is 3 there and 4 here\. Name another file"),
         (["--seed", "3", "--eval-episodes", "2"], "eval_episodes is 5 there and 2 here"),
         (["--seed", "3", "-params", "learning_starts:20", "batch_size:16"], "batch_size is 8 there and 16 here"),
+        (["--seed", "3", "--eval-env-kwargs", "theta_rew_fraction:0.5"], "eval_env_kwargs is .*1.0.* there and .*0.5.* here"),
         (["--seed", "3", "--n-timesteps", "40"], r"--n-timesteps 40: .* is at step 50 already"),
     ],
 )
@@ -124,6 +186,14 @@ def test_the_command_line_refuses_the_checkpoint_of_another_run(
     with pytest.raises(ValueError, match=message):
         zoo.main([*command, *changed])
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_an_entry_with_another_evaluation_is_another_run(command: list[str], tmp_path: Path) -> None:
+    config = yaml.safe_load(zoo.DEFAULT_CONFIG.read_text())
+    config["robust_bisim/SparseCartPole-v0"]["eval_env_kwargs"] = {"theta_rew_fraction": 0.5}
+    (tmp_path / "other.yml").write_text(yaml.dump(config))
+    with pytest.raises(ValueError, match=r"eval_env_kwargs is .*1\.0.* there and .*0\.5.* here"):
+        zoo.main([*command, "--seed", "3", "-conf", str(tmp_path / "other.yml")])
 
 
 def test_a_run_that_goes_on_may_become_longer(command: list[str], capsys: pytest.CaptureFixture) -> None:

@@ -145,6 +145,28 @@ def test_a_model_without_bonus_unbinds_the_wrapper_that_another_left_bound() -> 
     assert model.replay_buffer.rewards[:12].tolist() == [[5.0]] * 12
 
 
+def test_each_model_learns_from_its_own_bonus_though_they_share_the_environments(tmp_path: Any) -> None:
+    model = BisimSAC("MlpPolicy", DummyVecEnv([Countdown]), intrinsic_reward_scale=1e6, intrinsic_reward_max=0.5, **SMALL)
+    model.learn(3)
+    without = BisimSAC("MlpPolicy", model.get_env(), **SMALL).learn(3)
+    model.learn(3, reset_num_timesteps=False)
+    assert model.replay_buffer.rewards[:6].tolist() == [[5.5]] * 6
+    assert without.replay_buffer.rewards[:3].tolist() == [[5.0]] * 3
+
+
+def test_a_vec_env_that_does_not_tell_where_an_episode_ended_is_taken_as_it_is() -> None:
+    class Silent(VecEnvWrapper):
+        def reset(self) -> np.ndarray:
+            return self.venv.reset()
+
+        def step_wait(self) -> Any:
+            obs, rewards, dones, infos = self.venv.step_wait()
+            return obs, rewards, dones, [{} for _ in infos]
+
+    model = BisimSAC("MlpPolicy", Silent(DummyVecEnv([Countdown])), intrinsic_reward_scale=1.0, **SMALL)
+    assert model.learn(30).num_timesteps == 30
+
+
 def test_under_vecnormalize_it_reads_normalised_observations_and_reaches_the_buffer() -> None:
     venv = VecNormalize(IntrinsicRewardVecEnv(DummyVecEnv([Countdown])), norm_reward=False)
     model = BisimSAC("MlpPolicy", venv, intrinsic_reward_scale=1e6, intrinsic_reward_max=0.5, **SMALL)

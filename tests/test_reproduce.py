@@ -170,6 +170,17 @@ def test_results_of_another_configuration_are_refused(tmp_path) -> None:
     assert not (tmp_path / "work").exists()
 
 
+def test_no_run_waits_for_another_seed_of_its_method(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    from reproduce import train
+
+    for seed in ("seed0", "seed1"):
+        name = f"N_m1_normed-IR-max0.1_{seed}"
+        (tmp_path / f"{name}.json").write_text(json.dumps({"seed": seed}))
+        train([], tmp_path / "work" / name, tmp_path / f"{name}.json", {"seed": seed}, "a commit", ())
+    assert len(list(tmp_path.glob("work/*.lock"))) == 2
+
+
 def test_a_run_that_broke_off_does_not_hide_the_others(tmp_path) -> None:
     shutil.copytree(ROOT / "benchmarks/results/dmc_pixels", tmp_path / "results/dmc_pixels")
     path = tmp_path / "results/dmc_pixels/video_SAC_seed0.json"

@@ -20,6 +20,7 @@ from stable_baselines3.her import HerReplayBuffer
 from torch import nn
 
 from sb3_robust_bisim import BisimSAC, IntrinsicRewardVecEnv
+from sb3_robust_bisim.encoders import MlpEncoder
 from sb3_robust_bisim.latent_models import DYNAMICS
 from sb3_robust_bisim.losses import DISTANCES
 
@@ -298,6 +299,28 @@ def test_net_arch_optimizer_and_the_users_dict_are_respected() -> None:
         assert isinstance(optimizer, th.optim.AdamW)
         assert optimizer.param_groups[0]["weight_decay"] == 0.3
     assert policy_kwargs == before
+
+
+def test_optimizer_settings_that_adams_fused_kernel_does_not_know_are_taken() -> None:
+    policy_kwargs = dict(net_arch=[16], optimizer_kwargs=dict(differentiable=True))
+    assert make_model(policy_kwargs=policy_kwargs).actor.optimizer.param_groups[0]["differentiable"]
+
+
+@pytest.mark.parametrize("share", [True, False])
+def test_a_frozen_encoder_stays_as_it_is(share: bool) -> None:
+    class Pretrained(MlpEncoder):
+        def __init__(self, observation_space: gym.Space) -> None:
+            super().__init__(observation_space)
+            self.requires_grad_(False)
+
+    policy_kwargs = dict(features_extractor_class=Pretrained, share_features_extractor=share, net_arch=[16])
+    model = make_model(policy_kwargs=policy_kwargs)
+    encoders = [model.critic.features_extractor, model.actor.features_extractor]
+    before = [parameters(encoder) for encoder in encoders]
+    mu = parameters(model.actor.mu)
+    model.learn(EPISODE + 4)
+    assert all(th.equal(old, parameters(encoder)) for old, encoder in zip(before, encoders, strict=True))
+    assert not th.equal(mu, parameters(model.actor.mu))
 
 
 def test_the_schedule_reaches_every_optimizer_but_that_of_the_inverse_dynamics() -> None:

@@ -171,6 +171,12 @@ def test_env_kwargs_of_the_command_line_reach_training_and_evaluation(zoo: Zoo, 
     evaluations = np.load(run / "evaluations.npz")
     np.testing.assert_array_equal(evaluations["results"], evaluations["ep_lengths"])
 
+    agent = str(run / "robust_bisim-SparseCartPole-v0.zip")
+    resumed = zoo("train", "--env", CARTPOLE, "-i", agent, "--eval-freq", "-1", "-f", str(tmp_path), *SHORT)
+    assert "env_kwargs={'noise_multiplier': 1}" in resumed
+    second = tmp_path / "bisim_sac" / "robust_bisim-SparseCartPole-v0_2" / "robust_bisim-SparseCartPole-v0" / "args.yml"
+    assert yaml.unsafe_load(second.read_text())["env_kwargs"] == {"noise_multiplier": 1}  # where `enjoy` looks
+
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
@@ -211,6 +217,26 @@ def test_the_report_does_not_call_an_agent_trained_that_is_not(
     np.savez(tmp_path / "evaluations.npz", timesteps=[20, 40], results=[[1.0, 2.0], [3.0, 1.0]])
     report(tmp_path, "a run", starts)
     assert last in capsys.readouterr().out
+
+
+def test_a_config_may_have_one_entry_for_all_tasks_and_variants_that_are_empty(zoo: Zoo, tmp_path: Path) -> None:
+    config = tmp_path / "default.yml"
+    config.write_text("variants:\ndefault: {policy: MlpPolicy, n_timesteps: 30, learning_starts: 20}\n")
+    common = ["train", "--env", "Pendulum-v1", "-conf", str(config), "-f", str(tmp_path), "--eval-freq", "-1"]
+    assert "Model:          " in zoo(*common)
+    with pytest.raises(ValueError, match=r"--variant DBC: for Pendulum-v1, .* has no variants"):
+        zoo(*common, "--variant", "DBC")
+
+
+def test_a_config_may_be_python(zoo: Zoo, tmp_path: Path) -> None:
+    config = tmp_path / "config.py"
+    entry = "dict(policy='MlpPolicy', n_timesteps=30, learning_starts=20, replay_buffer_class=ReplayBuffer)"
+    config.write_text(f"from stable_baselines3.common.buffers import ReplayBuffer\nhyperparams = {{'Pendulum-v1': {entry}}}\n")
+    common = ["train", "--env", "Pendulum-v1", "-conf", str(config), "-f", str(tmp_path), "--eval-freq", "-1"]
+    assert "Model:          " in zoo(*common)
+    study = ["--storage", f"sqlite:///{tmp_path}/study.db", "--study-name", "pendulum", "--trial-id", "1"]
+    with pytest.raises(ValueError, match=r"config\.py: --trial-id needs a YAML file"):
+        zoo(*common, *study)
 
 
 def test_a_run_that_was_stopped_says_so(zoo: Zoo, tmp_path: Path) -> None:
@@ -256,6 +282,13 @@ def test_optuna_samples_arguments_that_bisim_sac_takes(monkeypatch: pytest.Monke
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     study.optimize(objective, n_trials=3)
     assert len({trial.value for trial in study.trials}) == 3
+
+
+def test_optuna_takes_policy_kwargs_that_are_an_expression(monkeypatch: pytest.MonkeyPatch) -> None:
+    tuned = {"policy_kwargs": "dict(n_critics=1, optimizer_kwargs=dict(eps=1e-5))"}  # as in the zoo's own files
+    monkeypatch.setattr(BisimExperimentManager, "tuned", tuned)
+    sampled = sample_bisim_sac_params(optuna.create_study().ask(), 1, 1, NO_HER)
+    assert sampled["policy_kwargs"].items() >= {"n_critics": 1, "optimizer_kwargs": {"eps": 1e-5}}.items()
 
 
 def test_optuna_leaves_off_what_the_tuned_method_leaves_off(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -57,13 +57,13 @@ class DiagnosticCallback(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
-        if self._steps_since > 0:
+        # The zoo calls this also when training has failed or not begun, and then nothing may hide the reason
+        if self._steps_since > 0 and all(param.isfinite().all() for param in self.model.policy.parameters()):
             self._look()
 
     @property
     def _steps_since(self) -> int:
-        assert self._last_look is not None  # set when training starts
-        return self.num_timesteps - self._last_look
+        return 0 if self._last_look is None else self.num_timesteps - self._last_look
 
     def _look(self) -> None:
         self._last_look = self.num_timesteps
@@ -111,9 +111,15 @@ class EnvironmentCallback(DiagnosticCallback):
         self.env_id = env_id
         self.env_kwargs = env_kwargs or {}
         self.seed = seed
+        self._venv: VecEnv | None = None
+
+    @property
+    def venv(self) -> VecEnv:
+        assert self._venv is not None  # made when training starts
+        return self._venv
 
     def _prepare(self) -> None:
-        self.venv = self._make_env()
+        self._venv = self._make_env()
         if self.venv.observation_space != self.model.observation_space:
             raise ValueError(
                 f"env_id={self.env_id!r}, env_kwargs={self.env_kwargs}: {type(self).__name__} would see "
@@ -123,7 +129,9 @@ class EnvironmentCallback(DiagnosticCallback):
 
     def _on_training_end(self) -> None:
         super()._on_training_end()
-        self.venv.close()
+        if self._venv is not None:
+            self._venv.close()
+            self._venv = None
 
     def _make_env(self) -> VecEnv:
         training = self.model.get_env()

@@ -9,6 +9,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_robust_bisim.callbacks.diagnostic import DiagnosticCallback, embed, new_axes
+from sb3_robust_bisim.frame_buffer import frames_per_observation
 
 
 class EmbeddingCallback(DiagnosticCallback):
@@ -65,7 +66,8 @@ class EmbeddingCallback(DiagnosticCallback):
         """The newest frame of each stack, (B, 3, H, W) in [0, 1]; None where there are no images."""
         if isinstance(obs, dict) or not is_image_space(self.model.observation_space):
             return None
-        newest = obs[:, -3:] if obs.shape[1] % 3 == 0 else obs[:, -1:].repeat(1, 3, 1, 1)
+        in_colour = obs.shape[1] == 3 * frames_per_observation(self.training_env)
+        newest = obs[:, -3:] if in_colour else obs[:, -1:].repeat(1, 3, 1, 1)
         return (newest.float() / 255).clamp(0, 1)
 
 

@@ -33,7 +33,7 @@ from _figures import FIGURES, Figure, Method, Panel
 from tqdm import tqdm
 
 from sb3_robust_bisim import BisimSAC
-from sb3_robust_bisim.zoo import check_keys, variant_settings
+from sb3_robust_bisim.zoo_config import check_keys, variant_settings
 
 ROOT = Path(__file__).resolve().parent
 CONFIG = ROOT.parent / "zoo_configs" / "bisim_sac.yml"

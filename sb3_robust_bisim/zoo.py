@@ -8,35 +8,26 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
 import optuna
 import rl_zoo3.enjoy
 import rl_zoo3.train
 import yaml
-from matplotlib.figure import Figure
-from rl_zoo3 import ALGOS, exp_manager
+from rl_zoo3 import ALGOS
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, convert_offpolicy_params, sample_sac_params
 from rl_zoo3.utils import EnvironmentName, get_class_by_name
-from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
-from sb3_robust_bisim.atomic import atomic_path
 from sb3_robust_bisim.bisim_sac import BisimSAC
 from sb3_robust_bisim.checkpoint import Checkpoint, load_checkpoint, read_about
-from sb3_robust_bisim.checks import closest
+from sb3_robust_bisim.report import report
+from sb3_robust_bisim.zoo_config import check_keys, check_task, entry_of, is_yaml, policy_kwargs_of, variant_settings
 
 ALGO = "bisim_sac"
 DEFAULT_CONFIG = Path("zoo_configs/bisim_sac.yml")
 WEIGHTS = (("bisim_coef", 0.05, 5.0), ("intrinsic_reward_scale", 0.01, 20.0), ("inverse_dynamics_coef", 0.01, 20.0))
-# What an entry of a zoo YAML may hold beside the arguments of the algorithm
-ZOO_KEYS = (
-    *("callback", "env_kwargs", "env_wrapper", "eval_env_kwargs", "frame_stack", "monitor_kwargs", "n_envs"),
-    *("n_timesteps", "noise_std", "noise_type", "normalize", "policy", "variants", "vec_env_wrapper"),
-)
-PASSED_BY_THE_ZOO = {"kwargs", "env", "seed", "verbose", "device", "tensorboard_log", "_init_setup_model"}
 
 
 def sample_bisim_sac_params(
@@ -45,7 +36,7 @@ def sample_bisim_sac_params(
     """Optuna's search space: that of SAC, and the weights of metric, bonus and inverse dynamics where the method has them."""
     sampled = sample_sac_params(trial, n_actions, n_envs, additional_args)
     # SAC's sampler replaces all of policy_kwargs
-    sampled["policy_kwargs"] = {**_policy_kwargs(BisimExperimentManager.tuned), **sampled["policy_kwargs"]}
+    sampled["policy_kwargs"] = {**policy_kwargs_of(BisimExperimentManager.tuned), **sampled["policy_kwargs"]}
     for name, low, high in WEIGHTS:
         if BisimExperimentManager.tuned.get(name, inspect.signature(BisimSAC).parameters[name].default) > 0:
             sampled[name] = trial.suggest_float(name, low, high, log=True)
@@ -55,70 +46,6 @@ def sample_bisim_sac_params(
 ALGOS[ALGO] = BisimSAC
 HYPERPARAMS_SAMPLER[ALGO] = sample_bisim_sac_params
 HYPERPARAMS_CONVERTER[ALGO] = convert_offpolicy_params
-
-
-def _policy_kwargs(settings: dict[str, Any]) -> dict[str, Any]:
-    """Those of an entry, which may be a Python expression, as in most of the zoo's own files."""
-    policy_kwargs = settings.get("policy_kwargs", {})
-    return eval(policy_kwargs, vars(exp_manager)) if isinstance(policy_kwargs, str) else policy_kwargs
-
-
-def is_yaml(config: str | Path) -> bool:
-    """The zoo takes a Python module as well, which it imports."""
-    return Path(config).suffix in (".yml", ".yaml")
-
-
-def variant_settings(config: str | Path, env_id: str, *names: str) -> dict[str, Any]:
-    """
-    The settings that named variants of a config file lay over the entry of a task, the last one on top.
-
-    :param config: YAML file with a mapping ``variants``, and perhaps another one inside the task's entry
-    :param env_id: the task
-    :param names: variants, ("DBC",) or ("SAC", "clean", "small") for example
-    :raises ValueError: if the file knows no such variant
-    """
-    if not is_yaml(config):
-        raise ValueError(f"-conf {config}: --variant needs a YAML file.")
-    content = yaml.safe_load(Path(config).read_text())
-    general, own = content.get("variants") or {}, content.get(env_id, {}).get("variants") or {}
-    settings: dict[str, Any] = {}
-    for name in names:
-        if name not in general and name not in own:
-            raise ValueError(f"--variant {name}: for {env_id}, {config} has {', '.join({**general, **own}) or 'no variants'}.")
-        settings |= {**general.get(name, {}), **own.get(name, {})}
-    return settings
-
-
-def check_keys(hyperparams: dict[str, Any], source: str) -> None:
-    """
-    Refuse keys that nobody would read, before a run folder exists.
-
-    :param hyperparams: an entry of a config file for BisimSAC
-    :param source: file name, for the message
-    :raises ValueError: naming the key and the closest known one
-    """
-    known = {*ZOO_KEYS, *inspect.signature(BisimSAC).parameters, *inspect.signature(SAC).parameters} - PASSED_BY_THE_ZOO
-    for key in hyperparams:
-        if key not in known:
-            raise ValueError(f"{source}: unknown key {key!r}{closest(key, known)}")
-
-
-def check_task(env_id: str, config: str) -> None:
-    """
-    Refuse a task without an entry, for the zoo does not say which there are.
-
-    :param env_id: the task
-    :param config: file of hyperparameters; only a YAML file can be looked into
-    :raises ValueError: naming the tasks that have one
-    """
-    if not is_yaml(config):
-        return
-    tasks = [key for key in yaml.safe_load(Path(config).read_text()) if key != "variants"]
-    if env_id not in tasks and "default" not in tasks:  # the zoo's entry for any task
-        raise ValueError(
-            f"--env {env_id}: {config} has settings for {', '.join(tasks)}. Copy the entry of a task that is like yours, in "
-            "this file or in one of your own, which -conf names."
-        )
 
 
 class BisimExperimentManager(ExperimentManager):
@@ -189,8 +116,8 @@ class BisimExperimentManager(ExperimentManager):
         if not is_yaml(self.config):
             raise ValueError(f"-conf {self.config}: --trial-id needs a YAML file.")
         found = self.load_trial(self.storage, self.study_name, self.trial_id)
-        entry = yaml.safe_load(Path(self.config).read_text()).get(self.env_name.gym_id, {})
-        return {**found, "policy_kwargs": {**_policy_kwargs({**entry, **settings}), **found["policy_kwargs"]}}
+        entry = entry_of(self.config, self.env_name.gym_id)
+        return {**found, "policy_kwargs": {**policy_kwargs_of({**entry, **settings}), **found["policy_kwargs"]}}
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         if self.checkpoint is None:
@@ -283,37 +210,6 @@ class BisimExperimentManager(ExperimentManager):
             return self.create_envs(1, eval_env=True)
         finally:
             self.eval_env_kwargs = eval_env_kwargs
-
-
-def report(run: Path, title: str, learning_starts: int) -> None:
-    """
-    Draw the learning curve of a run and print where it began and where it ended.
-
-    :param run: folder with the ``evaluations.npz`` of SB3's EvalCallback; without one there is nothing to report
-    :param title: of the picture
-    :param learning_starts: steps before which nothing was learned, -1 if the agent had learned before
-    """
-    if not (run / "evaluations.npz").exists():
-        print("No evaluation, no learning curve: --eval-freq was larger than the number of steps, or negative.")
-        return
-    with np.load(run / "evaluations.npz") as evaluations:
-        steps, returns = evaluations["timesteps"], evaluations["results"]
-    episodes = returns.shape[1]
-    mean, standard_error = returns.mean(axis=1), returns.std(axis=1, ddof=min(1, episodes - 1)) / np.sqrt(episodes)
-    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
-    axes = figure.subplots()
-    axes.plot(steps, mean, marker=".")
-    axes.fill_between(steps, mean - standard_error, mean + standard_error, alpha=0.25)
-    axes.set(title=title, xlabel="environment steps", ylabel=f"evaluation return, mean of {episodes} episodes")
-    axes.grid(alpha=0.3)
-    with atomic_path(run / "learning_curve.png") as temporary:
-        figure.savefig(temporary, dpi=120, format="png")
-    print(f"Evaluation return, mean of {episodes} episodes:")
-    print(f"  {'before training' if steps[0] <= learning_starts else 'at first'} (step {steps[0]}): {mean[0]:.1f}")
-    best = int(mean.argmax())
-    print(f"  best (step {steps[best]}): {mean[best]:.1f}, kept as {run / 'best_model.zip'}")
-    print(f"  {'after' if steps[-1] > learning_starts else 'still before'} training (step {steps[-1]}): {mean[-1]:.1f}")
-    print(f"Learning curve: {run / 'learning_curve.png'}")
 
 
 def main(arguments: list[str] | None = None) -> None:

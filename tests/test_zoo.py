@@ -13,7 +13,9 @@ import yaml
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER
 
 from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer
-from sb3_robust_bisim.zoo import BisimExperimentManager, check_keys, main, report, sample_bisim_sac_params, variant_settings
+from sb3_robust_bisim.report import report
+from sb3_robust_bisim.zoo import BisimExperimentManager, main, sample_bisim_sac_params
+from sb3_robust_bisim.zoo_config import check_keys, variant_settings
 
 ROOT = Path(__file__).parent.parent
 CONFIG = ROOT / "zoo_configs" / "bisim_sac.yml"

@@ -14,9 +14,10 @@ from matplotlib.figure import Figure as MatplotlibFigure
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Figure
 from stable_baselines3.common.type_aliases import PyTorchObs
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecFrameStack
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack
 
 from sb3_robust_bisim.bisim_sac import BisimSAC
+from sb3_robust_bisim.frame_buffer import frames_per_observation
 
 LONGEST_WALK = 100_000  # steps of one look, far more than it takes where episodes end
 NOT_FOR_FIGURES = ("stdout", "log", "json", "csv")
@@ -146,11 +147,8 @@ class EnvironmentCallback(DiagnosticCallback):
         kwargs = {key: value for key, value in spec.kwargs.items() if key != "render_mode"}
         bare = dataclasses.replace(spec, additional_wrappers=(), kwargs={**kwargs, **self.env_kwargs})
         venv: VecEnv = DummyVecEnv([lambda: gym.make(bare)])
-        layer: VecEnv = training
-        while isinstance(layer, VecEnvWrapper):
-            if isinstance(layer, VecFrameStack):
-                venv = VecFrameStack(venv, layer.stacked_obs.n_stack)
-            layer = layer.venv
+        if (n_stack := frames_per_observation(training)) > 1:
+            venv = VecFrameStack(venv, n_stack)
         return self.model._wrap_env(venv, monitor_wrapper=False)
 
     def _walk(self) -> Iterator["Step"]:

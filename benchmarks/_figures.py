@@ -2,7 +2,7 @@
 What is compared: tasks, methods, seeds and steps, after the figures of the paper. The settings are those of zoo_configs/.
 
 At a scale that a small machine finishes: the paper runs 10 seeds (5 from pixels), 50,000 steps of cartpole, 100,000 of
-pendulum and mountain car, 500,000 of each of 16 environments from pixels. `dmc_state`, `bf16`, the methods `self-prediction`
+pendulum and mountain car, 500,000 of each of 16 environments from pixels. `dmc_state`, `bf16`, `metric`, the methods `self-prediction`
 and `self-prediction-IR` and those with `half` in their names are not in the paper.
 """
 
@@ -32,11 +32,17 @@ class Panel:
 
 @dataclass(frozen=True)
 class Method:
-    """Variants of zoo_configs/bisim_sac.yml and what is laid over them; ``panels``: where it is run (none: everywhere)."""
+    """
+    Variants of zoo_configs/bisim_sac.yml and what is laid over them.
+
+    :param panels: where it is run (none: everywhere)
+    :param seeds: fewer than the figure's (None: as many)
+    """
 
     variants: tuple[str, ...]
     params: dict[str, Any] = field(default_factory=dict)
     panels: tuple[str, ...] = ()
+    seeds: int | None = None
 
 
 @dataclass(frozen=True)
@@ -81,6 +87,20 @@ FIGURES = {
             "self-prediction-IR": Method(("self-prediction",), {"intrinsic_reward_scale": 2.0}, ("N_m=2", "N_m=3")),
         },
         *(5, 10_000, 500, 10, 17),
+        rows=ALL_ROWS,
+    ),
+    # everything the same but the metric
+    "metric": Figure(
+        _noisy(CARTPOLE, 2, 3),
+        {
+            "normed-IR-ID": Method(("normed-IR-ID",)),
+            "normed-IR-ID-no-metric": Method(("normed-IR-ID", "no-metric")),
+            "normed-IR": Method(("normed-IR",), seeds=5),
+            "normed-IR-no-metric": Method(("normed-IR", "no-metric"), seeds=5),
+            "IR": Method(("DBC-IR", "no-metric"), seeds=5),  # no ball either
+            "self-prediction-IR": Method(("self-prediction",), {"intrinsic_reward_scale": 2.0}, seeds=5),
+        },
+        *(10, 10_000, 500, 10, 17),
         rows=ALL_ROWS,
     ),
     "mountain_car": Figure(

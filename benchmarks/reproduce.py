@@ -132,7 +132,7 @@ def runs_of(name: str, figure: Figure, seeds: int) -> list[Run]:
         for seed in range(seeds)
         for panel_name, panel in figure.panels.items()
         for method_name, method in figure.methods.items()
-        if panel_name in (method.panels or figure.panels)
+        if panel_name in (method.panels or figure.panels) and seed < (method.seeds or seeds)
     ]
 
 

@@ -62,7 +62,9 @@ def record() -> dict[str, dict[str, Any]]:
         model.learn(settings["learning_starts"] + UPDATES, log_interval=10**9)  # nothing leaves the logger
         # sorted: what counts is the numbers, not the names and the order of the modules
         hashes = sorted(hashlib.sha256(p.detach().numpy().tobytes()).hexdigest() for p in model.policy.parameters())
-        logged = {key: float(value) for key, value in sorted(model.logger.name_to_value.items()) if not key.startswith("time/")}
+        logged = {
+            key: float(value) for key, value in sorted(model.logger.name_to_value.items()) if not key.startswith("time/")
+        }
         recorded[name] = {"parameters": hashlib.sha256("".join(hashes).encode()).hexdigest()[:16], **logged}
     return recorded
 

@@ -2,8 +2,7 @@
 What does a gradient step cost, beside SB3's SAC and beside the matrix products that it cannot do without?
 
 Arms: SB3's SAC (fp32, same encoder class, widths and batch), BisimSAC with everything on (metric, norm, dynamics, reward,
-bonus, inverse), the same with PyTorch's default matrix product in place of oneDNN's (`full_mkl`, see fast_paths.py), BisimSAC
-with everything off, and the floor: the full method's matrix products and convolutions alone, with the default product. Each
+bonus, inverse), BisimSAC with everything off, and the floor: the full method's matrix products and convolutions alone. Each
 with the actor every 2nd update (`paper`) and every update (`sac`), in fp32 and with bf16=True. All arms are interleaved in
 one process, one thread; peak memory is that of a process per arm. The last line printed is one JSON object.
 """
@@ -16,9 +15,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
-from unittest import mock
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -33,7 +30,7 @@ from stable_baselines3.common.vec_env import VecFrameStack
 from torch.nn import functional as F
 from tqdm import tqdm
 
-from sb3_robust_bisim import BisimSAC, IntrinsicRewardVecEnv, bisim_sac
+from sb3_robust_bisim import BisimSAC, IntrinsicRewardVecEnv
 from sb3_robust_bisim.encoders import MlpEncoder, PixelEncoder
 
 BATCH = {"mlp": 512, "cnn": 128}
@@ -144,13 +141,6 @@ def build_arms(kind: str, per_round: int) -> dict[Arm, Callable[[], None]]:
         model = build(kind, *arm)
         return lambda: model.train(per_round, BATCH[kind])
 
-    def with_default_product(run: Callable[[], None]) -> Callable[[], None]:
-        def patched() -> None:
-            with mock.patch.object(bisim_sac, "exact_onednn_matmul", return_value=nullcontext()):
-                run()
-
-        return patched
-
     def repeated(run: Callable[[], None]) -> Callable[[], None]:
         def repeat() -> None:
             for _ in range(per_round):
@@ -161,7 +151,6 @@ def build_arms(kind: str, per_round: int) -> dict[Arm, Callable[[], None]]:
     arms = {SB3_SAC: trainer(SB3_SAC)}
     for schedule, bf16 in itertools.product(SCHEDULE, (False, True)):
         arms |= {(name, schedule, bf16): trainer((name, schedule, bf16)) for name in ("full", "off")}
-        arms["full_mkl", schedule, bf16] = with_default_product(arms["full", schedule, bf16])
         arms["floor", schedule, bf16] = repeated(floor(kind, schedule, bf16))
     return arms
 
@@ -187,14 +176,14 @@ def update_times(kind: str, rounds: int, per_round: int) -> dict[str, dict]:
     result: dict[str, dict] = {"fp32": {}, "bf16": {}}
     for schedule, bf16 in itertools.product(SCHEDULE, (False, True)):
         entry: dict[str, float | list[float]] = {}
-        for name in ("sb3_sac", "full", "full_mkl", "off", "floor"):
+        for name in ("sb3_sac", "full", "off", "floor"):
             arm = SB3_SAC if name == "sb3_sac" else (name, schedule, bf16)
             entry[f"{name}_ms"] = round(float(np.median(times[arm])), 3)
             entry[f"{name}_ms_quartiles"] = np.percentile(times[arm], [25, 75]).round(3).tolist()
             if arm in memory:
                 entry[f"{name}_peak_mib"] = round(memory[arm])
             # the ratio of each round, so that a slow spell of the machine strikes both sides
-            if name.startswith("full"):
+            if name == "full":
                 for other, beside in (("sac", SB3_SAC), ("floor", ("floor", schedule, bf16))):
                     ratios = np.divide(times[arm], times[beside])
                     entry[f"{name}_over_{other}"] = round(float(np.median(ratios)), 3)

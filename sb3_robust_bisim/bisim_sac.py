@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from sb3_robust_bisim import losses
 from sb3_robust_bisim.atomic import atomic_save
 from sb3_robust_bisim.checks import check_arguments, check_names
-from sb3_robust_bisim.fast_paths import exact_onednn_matmul, unchecked_distributions
+from sb3_robust_bisim.fast_paths import unchecked_distributions
 from sb3_robust_bisim.intrinsic_reward import IntrinsicRewardVecEnv, with_intrinsic_reward
 from sb3_robust_bisim.last_embedding import LastEmbedding
 from sb3_robust_bisim.latent_models import Dynamics
@@ -157,7 +157,7 @@ class BisimSAC(SAC):
         return self.model_coef
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        with unchecked_distributions(), exact_onednn_matmul(self.device):
+        with unchecked_distributions():
             self._train(gradient_steps, batch_size)
 
     def _train(self, gradient_steps: int, batch_size: int) -> None:

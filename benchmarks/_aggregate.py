@@ -12,7 +12,7 @@ from matplotlib.figure import Figure as Picture
 from matplotlib.ticker import MaxNLocator
 from rliable import library, metrics
 
-from sb3_robust_bisim.atomic import atomic_path
+from sb3_robust_bisim.runs.atomic import atomic_path
 
 Result = dict[str, Any]
 Curve = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # steps, middle, low, high

@@ -31,9 +31,9 @@ from scipy.stats import spearmanr
 from tqdm import tqdm
 
 from sb3_robust_bisim import BisimSAC
-from sb3_robust_bisim.atomic import atomic_path
 from sb3_robust_bisim.latent_models import Dynamics
 from sb3_robust_bisim.losses import Distance, on_surface, pairwise_distance
+from sb3_robust_bisim.runs.atomic import atomic_path
 from sb3_robust_bisim.theory import FiniteMDP, policy_bisimulation_metric
 
 ROOT = Path(__file__).parent

@@ -33,7 +33,7 @@ from _figures import FIGURES, Figure, Method, Panel
 from tqdm import tqdm
 
 from sb3_robust_bisim import BisimSAC
-from sb3_robust_bisim.zoo_config import check_keys, variant_settings
+from sb3_robust_bisim.cli.zoo_config import check_keys, variant_settings
 
 ROOT = Path(__file__).resolve().parent
 CONFIG = ROOT.parent / "zoo_configs" / "bisim_sac.yml"
@@ -186,7 +186,7 @@ def train(command: list[str], folder: Path, result_path: Path, identity: dict, c
 
 
 def write(path: Path, text: str) -> None:
-    from sb3_robust_bisim.atomic import atomic_path
+    from sb3_robust_bisim.runs.atomic import atomic_path
 
     with atomic_path(path) as temporary:
         temporary.write_text(text)
@@ -208,7 +208,7 @@ def begin(folder: Path, measured: dict) -> dict:
 
 def learn(command: list[str], folder: Path) -> dict[str, str]:
     """Train to the end, unless that has been done; under "stopped" why it ended before."""
-    from sb3_robust_bisim.zoo import main
+    from sb3_robust_bisim.cli.zoo import main
 
     if (folder / "trained.json").exists():
         return json.loads((folder / "trained.json").read_text())

@@ -15,7 +15,6 @@ from stable_baselines3.sac.sac import SAC
 from torch.nn import functional as F
 
 from sb3_robust_bisim import losses
-from sb3_robust_bisim.atomic import atomic_save
 from sb3_robust_bisim.checks import check_arguments, check_names
 from sb3_robust_bisim.fast_paths import unchecked_distributions
 from sb3_robust_bisim.intrinsic_reward import IntrinsicRewardVecEnv, with_intrinsic_reward
@@ -23,6 +22,7 @@ from sb3_robust_bisim.last_embedding import LastEmbedding
 from sb3_robust_bisim.latent_models import Dynamics
 from sb3_robust_bisim.losses import Distance
 from sb3_robust_bisim.policies import BisimActor, BisimCritic, BisimPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_robust_bisim.runs.atomic import atomic_save
 from sb3_robust_bisim.update_log import UpdateLog, embedding_statistics
 
 SelfBisimSAC = TypeVar("SelfBisimSAC", bound="BisimSAC")

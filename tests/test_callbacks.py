@@ -16,10 +16,11 @@ from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_robust_bisim import BisimSAC, zoo
+from sb3_robust_bisim import BisimSAC
 from sb3_robust_bisim.callbacks import DenoisingFactorCallback, EmbeddingCallback, ValueBoundCallback, diagnostic
-from sb3_robust_bisim.checkpoint import Checkpoint, load_checkpoint
+from sb3_robust_bisim.cli import zoo
 from sb3_robust_bisim.envs import NoiseObservation
+from sb3_robust_bisim.runs.checkpoint import Checkpoint, load_checkpoint
 
 SETTINGS: dict[str, Any] = dict(
     policy_kwargs=dict(net_arch=[16]), learning_starts=20, batch_size=16, buffer_size=200, train_freq=10, seed=0

@@ -19,9 +19,10 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack, VecNormalize
 
-from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer, IntrinsicRewardVecEnv, zoo
-from sb3_robust_bisim.atomic import atomic_path
-from sb3_robust_bisim.checkpoint import Checkpoint, load_checkpoint, read_about, save_checkpoint
+from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer, IntrinsicRewardVecEnv
+from sb3_robust_bisim.cli import zoo
+from sb3_robust_bisim.runs.atomic import atomic_path
+from sb3_robust_bisim.runs.checkpoint import Checkpoint, load_checkpoint, read_about, save_checkpoint
 
 STEPS = 120
 LEARNING = {**SMALL, "learning_starts": 20, "buffer_size": 200}
@@ -130,7 +131,7 @@ def test_what_a_kill_has_left_is_written_over(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.pkl"
     script = f"""
 import os, signal
-from sb3_robust_bisim.atomic import atomic_path
+from sb3_robust_bisim.runs.atomic import atomic_path
 with atomic_path({str(path)!r}, alone=True) as temporary:
     temporary.write_text("half a checkpoint")
     os.kill(os.getpid(), signal.SIGKILL)
@@ -202,7 +203,7 @@ def test_a_run_that_goes_on_may_become_longer(command: list[str], capsys: pytest
 
 
 def test_a_checkpoint_of_other_versions_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sb3_robust_bisim.checkpoint._versions", lambda: {"torch": "1.0"})
+    monkeypatch.setattr("sb3_robust_bisim.runs.checkpoint._versions", lambda: {"torch": "1.0"})
     save_checkpoint(tmp_path / "checkpoint.pkl", BisimSAC("MlpPolicy", "Pendulum-v1", **LEARNING))
     monkeypatch.undo()
     with pytest.raises(ValueError, match=r"needs the versions that it was written with: .*torch 1\.0 there and 2"):

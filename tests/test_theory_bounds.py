@@ -21,7 +21,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sb3_robust_bisim.bounds import (
+from sb3_robust_bisim.theory import (
+    Array,
+    FiniteMDP,
+    aggregate,
+    bisimulation_metric,
+    policy_bisimulation_metric,
+    policy_evaluation,
+)
+from sb3_robust_bisim.theory.bounds import (
     aggregation_value_bound,
     diameter_bound,
     mean_distance,
@@ -32,14 +40,6 @@ from sb3_robust_bisim.bounds import (
     reward_error,
     transition_error,
     value_difference_bound,
-)
-from sb3_robust_bisim.theory import (
-    Array,
-    FiniteMDP,
-    aggregate,
-    bisimulation_metric,
-    policy_bisimulation_metric,
-    policy_evaluation,
 )
 
 Cells = NDArray[np.intp]

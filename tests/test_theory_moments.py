@@ -7,7 +7,6 @@ from finite_mdps import BEFORE_FORK, FORK, MANY, THREE_APART, Setting, chain, di
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sb3_robust_bisim.bounds import mean_distance, mean_variance_bound, policy_variance_bound
 from sb3_robust_bisim.theory import (
     FiniteMDP,
     bisimulation_metric,
@@ -15,6 +14,7 @@ from sb3_robust_bisim.theory import (
     policy_bisimulation_metric,
     stationary_distribution,
 )
+from sb3_robust_bisim.theory.bounds import mean_distance, mean_variance_bound, policy_variance_bound
 
 SLACK = 1e-6  # the metrics carry an error of 1e-8, and rounding for p > 1
 

@@ -13,9 +13,9 @@ import yaml
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER
 
 from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer
-from sb3_robust_bisim.report import report
-from sb3_robust_bisim.zoo import BisimExperimentManager, main, sample_bisim_sac_params
-from sb3_robust_bisim.zoo_config import check_keys, variant_settings
+from sb3_robust_bisim.cli.report import report
+from sb3_robust_bisim.cli.zoo import BisimExperimentManager, main, sample_bisim_sac_params
+from sb3_robust_bisim.cli.zoo_config import check_keys, variant_settings
 
 ROOT = Path(__file__).parent.parent
 CONFIG = ROOT / "zoo_configs" / "bisim_sac.yml"
@@ -152,7 +152,7 @@ def test_training_from_pixels_ends_well_without_the_packages_for_video(
     zoo: Zoo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("dm_control")
-    monkeypatch.delitem(sys.modules, "sb3_robust_bisim.record", raising=False)
+    monkeypatch.delitem(sys.modules, "sb3_robust_bisim.cli.record", raising=False)
     monkeypatch.setitem(sys.modules, "imageio.v2", None)
     output = zoo(
         *("train", "--env", "robust_bisim/cartpole-swingup-pixels-v0", "-n", "20", "--eval-freq", "-1"),

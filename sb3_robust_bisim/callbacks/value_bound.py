@@ -36,7 +36,7 @@ class ValueBoundCallback(EnvironmentCallback):
     """
 
     def _prepare(self) -> None:
-        from sb3_robust_bisim.bounds import value_difference_bound  # the one callback that needs the extra
+        from sb3_robust_bisim.theory.bounds import value_difference_bound  # the one callback that needs the extra
 
         self._bound = value_difference_bound
         if self.model.c_r == 0 or self.model.gamma == 1:

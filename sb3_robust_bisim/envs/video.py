@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_robust_bisim.atomic import atomic_path
+from sb3_robust_bisim.runs.atomic import atomic_path
 
 CACHE_VARIABLE = "SB3_ROBUST_BISIM_CACHE"
 SPLITS = ("train", "eval")

@@ -29,7 +29,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnvWrapper
 
-from sb3_robust_bisim.atomic import atomic_path
+from sb3_robust_bisim.runs.atomic import atomic_path
 
 
 class Checkpoint(BaseCallback):

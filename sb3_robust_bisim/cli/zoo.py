@@ -21,9 +21,9 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_robust_bisim.bisim_sac import BisimSAC
-from sb3_robust_bisim.checkpoint import Checkpoint, load_checkpoint, read_about
-from sb3_robust_bisim.report import report
-from sb3_robust_bisim.zoo_config import check_keys, check_task, entry_of, is_yaml, policy_kwargs_of, variant_settings
+from sb3_robust_bisim.cli.report import report
+from sb3_robust_bisim.cli.zoo_config import check_keys, check_task, entry_of, is_yaml, policy_kwargs_of, variant_settings
+from sb3_robust_bisim.runs.checkpoint import Checkpoint, load_checkpoint, read_about
 
 ALGO = "bisim_sac"
 DEFAULT_CONFIG = Path("zoo_configs/bisim_sac.yml")
@@ -196,7 +196,7 @@ class BisimExperimentManager(ExperimentManager):
 
     def _record(self, model: BaseAlgorithm) -> None:
         try:
-            from sb3_robust_bisim.record import record
+            from sb3_robust_bisim.cli.record import record
         except ImportError as error:
             print(f"Agent at work:  not shown, {error.name} is missing: pip install sb3_robust_bisim[dmc]")
             return

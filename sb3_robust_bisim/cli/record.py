@@ -8,8 +8,8 @@ from PIL import Image
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_robust_bisim.atomic import atomic_path
 from sb3_robust_bisim.frame_buffer import frames_per_observation
+from sb3_robust_bisim.runs.atomic import atomic_path
 
 COLUMNS, ROWS = 8, 4
 MAX_FRAMES = 1000  # of a task whose episodes do not end

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_robust_bisim.theory import Array, FiniteMDP, check_discount, check_weights, wasserstein_distance
+from sb3_robust_bisim.theory.finite_mdp import Array, FiniteMDP, check_discount, check_weights, wasserstein_distance
 
 
 def diameter_bound(mdp: FiniteMDP, c_r: float, c_t: float) -> float:

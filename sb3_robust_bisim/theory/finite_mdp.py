@@ -1,7 +1,7 @@
 """Exact bisimulation metrics of finite Markov decision processes: the ground truth behind the learned embedding.
 
 Equation labels are those of Kemertas and Aumentado-Armstrong, "Towards Robust Bisimulation Metric Learning" (NeurIPS 2021).
-Needs the ``theory`` extra (SciPy and POT). The bounds built on these metrics are in :mod:`sb3_robust_bisim.bounds`.
+Needs the ``theory`` extra (SciPy and POT). The bounds built on these metrics are in :mod:`sb3_robust_bisim.theory.bounds`.
 Arrays of a wrong shape, what is no distribution, and weights outside their ranges raise ValueError.
 """
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from sb3_robust_bisim.atomic import atomic_path
+from sb3_robust_bisim.runs.atomic import atomic_path
 
 
 def report(run: Path, title: str, learning_starts: int) -> None:

@@ -31,8 +31,8 @@ from scipy.stats import spearmanr
 from tqdm import tqdm
 
 from sb3_robust_bisim import BisimSAC
-from sb3_robust_bisim.latent_models import Dynamics
-from sb3_robust_bisim.losses import Distance, on_surface, pairwise_distance
+from sb3_robust_bisim.losses import on_surface, pairwise_distance
+from sb3_robust_bisim.representation import Batch
 from sb3_robust_bisim.runs.atomic import atomic_path
 from sb3_robust_bisim.theory import FiniteMDP, policy_bisimulation_metric
 
@@ -59,9 +59,9 @@ class Arm:
 
     mdp: str
     noise: bool
-    distance: Distance
+    distance: str
     ball: bool
-    dynamics: Dynamics = "deterministic"
+    dynamics: str = "deterministic"
     inverse_dynamics_coef: float = 0.0
     reward_max: float = 4.0
 
@@ -154,7 +154,7 @@ def learned_distances(model: BisimSAC, observe: Observations, draws: int = 20) -
 
     :return: (S, S) and the (draws, S, n) embeddings
     """
-    z = th.stack([model.critic.encode(observe(np.arange(N_STATES))) for _ in range(2 * draws)])
+    z = th.stack([model.critic.features_extractor.encode(observe(np.arange(N_STATES))) for _ in range(2 * draws)])
     rows, columns = th.broadcast_tensors(z[:draws, :, None], z[draws:, None])
     distances = pairwise_distance(rows, columns, model.distance).mean(dim=(0, -1))
     return distances.numpy(), z.numpy()
@@ -188,7 +188,7 @@ def train(arm: Arm, seed: int, steps: int, path: Path) -> dict:
     mdp, policy = random_mdp(arm.mdp, arm.reward_max, rng)
     observe = Observations(arm.noise, rng)
     model = build(arm, observe, seed)
-    optimizers = [model.critic.optimizer, model.policy.inverse_dynamics.optimizer]
+    optimizers = [model.critic.optimizer, model.policy.representation.inverse_dynamics.optimizer]
     schedule = th.optim.lr_scheduler.CosineAnnealingLR(optimizers[0], steps, eta_min=1e-5)
     at_start, _ = learned_distances(model, observe)
     cumulative = mdp.transition.cumsum(axis=-1)
@@ -197,8 +197,10 @@ def train(arm: Arm, seed: int, steps: int, path: Path) -> dict:
         actions = (rng.random(BATCH_SIZE) > policy[states, 0]).astype(int)
         next_states = (cumulative[states, actions] < rng.random((BATCH_SIZE, 1))).sum(axis=1).clip(max=N_STATES - 1)
         rewards = th.as_tensor(mdp.reward[states, actions][:, None], dtype=th.float32)
-        z, next_z = model.critic.encode(observe(states)), model.critic.encode(observe(next_states))
-        loss, terms = model._representation_losses(z, next_z, th.as_tensor(ACTIONS[actions]), rewards)
+        encode = model.critic.features_extractor.encode
+        z, next_z = encode(observe(states)), encode(observe(next_states))
+        batch = Batch(z, th.as_tensor(ACTIONS[actions]), rewards, th.zeros_like(rewards), next_z, next_z.detach())
+        loss, terms = model.policy.representation.losses(batch)
         for optimizer in optimizers:
             optimizer.zero_grad()
         loss.backward()

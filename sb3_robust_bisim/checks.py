@@ -3,7 +3,7 @@
 import difflib
 import inspect
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -12,42 +12,15 @@ from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.sac.sac import SAC
 
-from sb3_robust_bisim.latent_models import DYNAMICS
-from sb3_robust_bisim.losses import DISTANCES
 from sb3_robust_bisim.policies import BisimPolicy, MlpPolicy, MultiInputPolicy
 
-if TYPE_CHECKING:
-    from sb3_robust_bisim.bisim_sac import BisimSAC
 
-
-def check_arguments(model: "BisimSAC") -> None:
+def check_arguments(model: Any) -> None:
     """
-    :param model: as it is before its nets are built
+    :param model: a BisimSAC, as it is before its nets are built
     :raises ValueError: for an argument outside its range, or arguments that contradict each other
     """
-    for name in ("bisim_coef", "c_r", "intrinsic_reward_scale", "intrinsic_reward_max", "inverse_dynamics_coef"):
-        _require(_is_number(getattr(model, name), 0), model, name, "a finite number >= 0")
-    _require(model.model_coef is None or _is_number(model.model_coef, 0), model, "model_coef", "None or a finite number >= 0")
-    needed = model.bisim_coef > 0 or model.intrinsic_reward_scale > 0
-    trained = model.model_coef != 0 or not needed
-    _require(trained, model, "model_coef", "above 0 where bisim_coef or intrinsic_reward_scale needs the dynamics model")
-    gamma_fits = model.c_t is not None or 0 <= model.gamma < 1
-    _require(gamma_fits, model, "gamma", "in [0, 1) when c_t is None, which stands for gamma")
-    below_one = model.c_t is None or (_is_number(model.c_t, 0) and model.c_t < 1)
-    _require(below_one, model, "c_t", "None (gamma) or in [0, 1), else no metric exists")
-    ordered = bool(
-        isinstance(model.reward_range, (tuple, list))
-        and len(model.reward_range) == 2
-        and all(map(_is_number, model.reward_range))
-        and model.reward_range[0] < model.reward_range[1]
-    )
-    _require(ordered, model, "reward_range", "(R_min, R_max), finite, with R_min < R_max")
-    for name in ("norm_constraint", "bf16"):
-        _require(isinstance(getattr(model, name), (bool, np.bool_)), model, name, "True or False")
-    point = model.norm_constraint and model.c_r == 0
-    _require(not point, model, "c_r", "above 0, or norm_constraint=False: the ball is a point")
-    _require(model.distance in DISTANCES, model, "distance", f"one of {', '.join(DISTANCES)}")
-    _require(model.dynamics in DYNAMICS, model, "dynamics", f"one of {', '.join(DYNAMICS)}")
+    _require(isinstance(model.bf16, (bool, np.bool_)), model, "bf16", "True or False")
     for name, least in (("policy_delay", 1), ("initial_gradient_steps", 0)):
         value = getattr(model, name)
         _require(isinstance(value, (int, np.integer)) and value >= least, model, name, f"an integer >= {least}")
@@ -64,10 +37,8 @@ def check_arguments(model: "BisimSAC") -> None:
             f"intrinsic_reward_scale={model.intrinsic_reward_scale} with HerReplayBuffer: relabelled transitions get the "
             "environment's reward, without the bonus. Set intrinsic_reward_scale=0."
         )
-    for name in sorted({"radius", "dynamics", "bf16"} & set(model.policy_kwargs)):
-        remedy = (
-            "it follows from norm_constraint, c_r, c_t and reward_range" if name == "radius" else f"pass {name} to BisimSAC"
-        )
+    for name in sorted({"objective", "bf16"} & set(model.policy_kwargs)):
+        remedy = "pass its settings to BisimSAC" if name == "objective" else f"pass {name} to BisimSAC"
         raise ValueError(f"policy_kwargs with {name}={model.policy_kwargs[name]!r}: BisimSAC sets it; {remedy}.")
     if not (isinstance(model.policy_class, type) and issubclass(model.policy_class, BisimPolicy)):
         raise ValueError(f"policy={model.policy_class!r}: it must be a subclass of sb3_robust_bisim.policies.BisimPolicy.")
@@ -75,7 +46,7 @@ def check_arguments(model: "BisimSAC") -> None:
         _check_policy_fits(model)
 
 
-def _check_policy_fits(model: "BisimSAC") -> None:
+def _check_policy_fits(model: Any) -> None:
     """Each policy's own encoder reads one kind of observation."""
     name, space = model.policy_class.__name__, model.observation_space
     is_dict = isinstance(space, spaces.Dict)
@@ -86,15 +57,7 @@ def _check_policy_fits(model: "BisimSAC") -> None:
         raise ValueError(f'policy="MlpPolicy" with images {space}: use "CnnPolicy".')
 
 
-def _is_number(value: Any, least: float = -np.inf) -> bool:
-    return (
-        isinstance(value, (int, float, np.number))
-        and not isinstance(value, bool)
-        and bool(np.isfinite(value) and value >= least)
-    )
-
-
-def _require(condition: Any, model: "BisimSAC", name: str, remedy: str) -> None:
+def _require(condition: Any, model: Any, name: str, remedy: str) -> None:
     if not condition:
         raise ValueError(f"{name}={getattr(model, name)!r}: it must be {remedy}.")
 

@@ -1,10 +1,75 @@
-"""Encoders phi: observation -> embedding z. Their output is projected onto the ball by the policy, whatever the encoder."""
+"""Encoders phi: observation -> embedding z. Any features extractor may be one; :class:`Encoder` makes it so."""
+
+from contextlib import nullcontext
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space, preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, create_mlp
+from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
+
+from sb3_robust_bisim.losses import project_to_ball
+
+
+class Encoder(BaseFeaturesExtractor):
+    """
+    phi: a features extractor, with what happens before it (cast, autocast) and after it (projection onto the ball).
+
+    :param extractor: gives the features, (B, n)
+    :param observation_space: what it reads
+    :param radius: of the ball that holds the embeddings, None for no constraint
+    :param bf16: run the extractor under bfloat16 autocast
+    :param normalize_images: whether images are to be divided by 255
+    """
+
+    def __init__(
+        self,
+        extractor: BaseFeaturesExtractor,
+        observation_space: spaces.Space,
+        radius: float | None,
+        bf16: bool,
+        normalize_images: bool,
+    ) -> None:
+        super().__init__(observation_space, extractor.features_dim)
+        self.extractor = extractor
+        self.radius = radius
+        self.bf16 = bf16
+        self.normalize_images = normalize_images
+
+    def encode(self, obs: "PyTorchObs | Encoded") -> th.Tensor:
+        """z = phi(s) in fp32 and inside the ball, (B, n). What has been encoded before is looked up."""
+        return obs[self] if isinstance(obs, Encoded) else self(self.preprocess(obs))
+
+    def preprocess(self, obs: PyTorchObs) -> PyTorchObs:
+        """Floats, images in [0, 1]; under bf16, images for our own extractor come at once as autocast would round them."""
+        if self.bf16 and self.normalize_images and type(self.extractor) is PixelEncoder:
+            assert isinstance(obs, th.Tensor)
+            return obs.to(th.bfloat16, copy=True).div_(255)  # 0..255 are exact in bf16
+        return preprocess_obs(obs, self._observation_space, self.normalize_images)
+
+    def forward(self, preprocessed: PyTorchObs) -> th.Tensor:
+        """:param preprocessed: output of :meth:`preprocess`"""
+        device = next(iter(preprocessed.values())).device if isinstance(preprocessed, dict) else preprocessed.device
+        with th.autocast(device.type, th.bfloat16) if self.bf16 else nullcontext():
+            features = self.extractor(preprocessed)
+        return project_to_ball(features.float(), self.radius)
+
+
+class Encoded(dict[Encoder, th.Tensor]):
+    """
+    Observations that actor and critics take in place of tensors: each encoder encodes them once, when it is first asked for.
+
+    :param preprocessed: output of ``Encoder.preprocess``, the same for all encoders of a policy
+    """
+
+    def __init__(self, preprocessed: PyTorchObs) -> None:
+        super().__init__()
+        self.preprocessed = preprocessed
+
+    def __missing__(self, encoder: Encoder) -> th.Tensor:
+        self[encoder] = encoder(self.preprocessed)
+        return self[encoder]
 
 
 class MlpEncoder(BaseFeaturesExtractor):

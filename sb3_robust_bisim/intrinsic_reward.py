@@ -1,12 +1,13 @@
 """The intrinsic reward as a VecEnv wrapper: it knows a callable, not the algorithm."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from copy import deepcopy
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_wrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 BonusFn = Callable[[Any, np.ndarray, Any], np.ndarray]
@@ -44,8 +45,9 @@ class IntrinsicRewardVecEnv(VecEnvWrapper):
         self._bonus = bonus
 
     def reset(self) -> VecEnvObs:
-        self._last_obs = self.venv.reset()
-        return self._last_obs
+        obs = self.venv.reset()
+        self._last_obs = deepcopy(obs)  # some VecEnvs write every observation into the same array
+        return obs
 
     def step_async(self, actions: np.ndarray) -> None:
         self._actions = actions
@@ -59,7 +61,7 @@ class IntrinsicRewardVecEnv(VecEnvWrapper):
             rewards = rewards + bonus
             for info, value in zip(infos, bonus.tolist(), strict=True):
                 info["intrinsic_reward"] = value
-        self._last_obs = obs
+        self._last_obs = deepcopy(obs)
         return obs, rewards, dones, infos
 
 
@@ -80,16 +82,28 @@ def _successors(obs: VecEnvObs, dones: np.ndarray, infos: list[dict[str, Any]]) 
     return obs
 
 
-def with_intrinsic_reward(
-    env: VecEnv, observation_space: spaces.Space, scale: float
-) -> tuple[VecEnv, IntrinsicRewardVecEnv | None]:
+@contextmanager
+def bound(env: VecEnv | None, bonus: BonusFn | None) -> Iterator[None]:
+    """Bind a bonus to the wrapper in a chain, if it has one, for the length of the block."""
+    wrapper = None if env is None else unwrap_vec_wrapper(env, IntrinsicRewardVecEnv)
+    if wrapper is None:
+        yield
+        return
+    wrapper.bind(bonus)
+    try:
+        yield
+    finally:
+        wrapper.bind(None)
+
+
+def with_intrinsic_reward(env: VecEnv, observation_space: spaces.Space, scale: float) -> VecEnv:
     """
-    Find the wrapper in a chain, and put one outermost if there is none and one is needed.
+    Check the order of the wrappers in a chain, and put the wrapper outermost if there is none and one is needed.
 
     :param env: the chain of the agent
     :param observation_space: what the agent sees
     :param scale: weight of the bonus; 0: no wrapper is needed
-    :return: the chain and its wrapper
+    :return: the chain
     :raises ValueError: if rewards are normalised on the way, if the wrapper's rewards would be ignored, or if it sees
         other observations than the agent
     """
@@ -108,7 +122,7 @@ def with_intrinsic_reward(
     if wrapper is not None and normalize is not None and chain.index(wrapper) < chain.index(normalize):
         raise ValueError(f"IntrinsicRewardVecEnv outside of VecNormalize: its rewards would be ignored; {remedy}")
     if scale == 0:
-        return env, wrapper
+        return env
     if wrapper is None and normalize is not None:
         raise ValueError(f"intrinsic_reward_scale={scale} under VecNormalize: {remedy}")
     if wrapper is None:
@@ -119,7 +133,7 @@ def with_intrinsic_reward(
             f"IntrinsicRewardVecEnv sees observations of {seen} numbers, the agent of {wanted}: put it outside of the "
             "wrapper that changes them (VecFrameStack, for example)."
         )
-    return env, wrapper
+    return env
 
 
 def _sizes(space: spaces.Space) -> Any:

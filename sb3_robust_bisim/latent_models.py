@@ -1,6 +1,6 @@
 """Models of the world in embedding space: dynamics P(z' | z, a), reward r(z') and inverse dynamics g_I(z, z')."""
 
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple
 
 import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
@@ -8,8 +8,7 @@ from torch import nn
 
 from sb3_robust_bisim.losses import project_to_ball
 
-Dynamics = Literal["deterministic", "probabilistic", "ensemble"]
-DYNAMICS: tuple[str, ...] = get_args(Dynamics)
+DYNAMICS = ("deterministic", "probabilistic", "ensemble")
 ENSEMBLE_SIZE = 5
 STD_MIN, STD_MAX = 1e-4, 10.0
 

@@ -3,13 +3,12 @@
 Shapes: ``B`` is the batch size, ``n`` the width of the embedding, ``K`` the number of dynamics models.
 """
 
-from typing import Any, Literal, get_args
+from collections.abc import Callable
+from typing import Any
 
 import torch as th
 from torch.nn import functional as F
 
-Distance = Literal["huber", "l1", "l2"]
-DISTANCES: tuple[str, ...] = get_args(Distance)
 ROUNDING = 1e-6  # more than fp32 errs in the norm of an embedding
 
 
@@ -60,48 +59,55 @@ def on_surface(norm: Any, radius: float) -> Any:
     return norm > radius * (1 - 2 * ROUNDING)
 
 
-def pairwise_distance(x: th.Tensor, y: th.Tensor, distance: str) -> th.Tensor:
+def huber(x: th.Tensor, y: th.Tensor, x_std: th.Tensor | None = None, y_std: th.Tensor | None = None) -> th.Tensor:
     """
-    Distance between matching rows of two batches.
+    Elementwise Huber distance, as in the paper's experiments: every coordinate is a distance of its own. Gaussians keep
+    their coordinates apart too: each coordinate has its own W2, sqrt(dmu^2 + dsigma^2).
+    """
+    if x_std is None or y_std is None:
+        return F.smooth_l1_loss(x, y, reduction="none")
+    return _squared_w2(x, y, x_std, y_std).sqrt()
 
-    ``huber`` is ELEMENTWISE, as in the paper's experiments: every coordinate is a distance of its own and nothing is
-    reduced. ``l1`` and ``l2`` are the norms of eq:general-bisim-loss, reduced over the last dimension.
+
+def l1(x: th.Tensor, y: th.Tensor, x_std: th.Tensor | None = None, y_std: th.Tensor | None = None) -> th.Tensor:
+    """L1 norm. The coordinates' W2 are summed: an upper bound of W2 under the L1 ground metric, exact for point masses."""
+    if x_std is None or y_std is None:
+        return (x - y).norm(p=1, dim=-1, keepdim=True)
+    return _squared_w2(x, y, x_std, y_std).sqrt().sum(dim=-1, keepdim=True)
+
+
+def l2(x: th.Tensor, y: th.Tensor, x_std: th.Tensor | None = None, y_std: th.Tensor | None = None) -> th.Tensor:
+    """L2 norm, and the closed form of W2 between diagonal Gaussians, sqrt(|dmu|^2 + |dsigma|^2)."""
+    if x_std is None or y_std is None:
+        return (x - y).norm(p=2, dim=-1, keepdim=True)
+    return _squared_w2(x, y, x_std, y_std).sum(dim=-1, keepdim=True).sqrt()
+
+
+def _squared_w2(x: th.Tensor, y: th.Tensor, x_std: th.Tensor, y_std: th.Tensor) -> th.Tensor:
+    """Squared 2-Wasserstein distance of each coordinate's Gaussians, (B, n)."""
+    return (x - y).square() + (x_std - y_std).square()
+
+
+# What `distance` may name. A new distance is one function of the same signature and one entry here
+DISTANCES: dict[str, Callable[..., th.Tensor]] = {"huber": huber, "l1": l1, "l2": l2}
+
+
+def pairwise_distance(
+    x: th.Tensor, y: th.Tensor, distance: str, x_std: th.Tensor | None = None, y_std: th.Tensor | None = None
+) -> th.Tensor:
+    """
+    Distance between matching rows of two batches: of points, or of the diagonal Gaussians around them.
 
     :param x: (B, n)
     :param y: (B, n)
-    :param distance: "huber", "l1" or "l2"
-    :return: (B, n) for "huber", else (B, 1)
+    :param distance: a key of ``DISTANCES``
+    :param x_std: (B, n) standard deviations, None for points; likewise ``y_std``
+    :return: (B, n) for "huber", which is elementwise, else (B, 1)
     :raises ValueError: for another distance
     """
-    _check_distance(distance)
-    if distance == "huber":
-        return F.smooth_l1_loss(x, y, reduction="none")
-    return (x - y).norm(p=1 if distance == "l1" else 2, dim=-1, keepdim=True)
-
-
-def gaussian_w2(mean_i: th.Tensor, std_i: th.Tensor, mean_j: th.Tensor, std_j: th.Tensor, distance: str = "l2") -> th.Tensor:
-    """
-    2-Wasserstein distance between diagonal Gaussians.
-
-    Each coordinate's own W2 is sqrt(dmu^2 + dsigma^2). ``l2`` reduces it to the closed form of the whole Gaussian,
-    ``l1`` sums the coordinates (an upper bound of the W2 under the L1 ground metric, exact for point masses), and
-    ``huber`` keeps the coordinates apart as the paper's experiments do.
-
-    :param mean_i: (B, n), likewise the other three
-    :param distance: "huber", "l1" or "l2"
-    :return: (B, n) for "huber", else (B, 1)
-    :raises ValueError: for another distance
-    """
-    _check_distance(distance)
-    squared = (mean_i - mean_j).square() + (std_i - std_j).square()
-    if distance == "l2":
-        return squared.sum(dim=-1, keepdim=True).sqrt()
-    return squared.sqrt() if distance == "huber" else squared.sqrt().sum(dim=-1, keepdim=True)
-
-
-def _check_distance(distance: str) -> None:
     if distance not in DISTANCES:
         raise ValueError(f"distance={distance!r}: it must be one of {', '.join(DISTANCES)}.")
+    return DISTANCES[distance](x, y, x_std, y_std)
 
 
 def bisim_loss(
@@ -130,11 +136,8 @@ def bisim_loss(
     z_distance = pairwise_distance(z, z[pairs], distance)
     with th.no_grad():
         reward_distance = pairwise_distance(rewards, rewards[pairs], distance)
-        if std is None:
-            transition_distance = pairwise_distance(mean, mean[pairs], distance)
-        else:
-            transition_distance = gaussian_w2(mean, std, mean[pairs], std[pairs], distance)
-        target = c_r * reward_distance + c_t * transition_distance
+        paired_std = None if std is None else std[pairs]
+        target = c_r * reward_distance + c_t * pairwise_distance(mean, mean[pairs], distance, std, paired_std)
     return F.mse_loss(z_distance, target), z_distance.detach().mean(), reward_distance.mean()
 
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 import torch as th
-
-from sb3_robust_bisim.losses import on_surface
+from stable_baselines3.common.logger import Logger
 
 
 class UpdateLog:
@@ -40,21 +39,10 @@ class UpdateLog:
             )
         return {name: float(np.mean([value for _, value in steps])) for name, steps in numbers.items()}
 
-
-def embedding_statistics(z: th.Tensor, radius: float | None) -> dict[str, th.Tensor]:
-    """
-    What tells a collapse (std and norm near 0) from an explosion (norm without bound) or a ball that is too small.
-
-    :param z: (B, n)
-    :param radius: of the ball that holds ``z``, None without one
-    :return: by TensorBoard key
-    """
-    norm = z.norm(dim=1)
-    statistics = {
-        "bisim/embedding_norm_mean": norm.mean(),
-        "bisim/embedding_norm_max": norm.max(),
-        "bisim/embedding_std": z.std(dim=0, unbiased=False).mean(),
-    }
-    if radius is not None:
-        statistics["bisim/clamp_fraction"] = on_surface(norm, radius).float().mean()
-    return statistics
+    def record(self, logger: Logger) -> None:
+        """Record the means, and of the metric's means the ratio."""
+        means = self.means()
+        for name, mean in means.items():
+            logger.record(name, mean)
+        if means.get("bisim/mu_rd", 0.0) > 0:  # all rewards equal: no ratio
+            logger.record("bisim/mu_ratio", means["bisim/mu_bd"] / means["bisim/mu_rd"])

@@ -168,11 +168,12 @@ def test_another_number_of_environments_is_refused_and_stays_unbound() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "remedy"), [("radius", "norm_constraint"), ("dynamics", "pass dynamics"), ("bf16", "pass bf16")]
+    ("name", "message"),
+    [("objective", "BisimSAC sets it; pass its settings to BisimSAC"), ("bf16", "BisimSAC sets it; pass bf16 to BisimSAC")],
 )
-def test_what_the_model_sets_is_refused_as_policy_kwargs(name: str, remedy: str) -> None:
-    with pytest.raises(ValueError, match=f"policy_kwargs with {name}='x'.*{remedy}"):
-        make_model(policy_kwargs={name: "x"})
+def test_what_bisim_sac_tells_its_policy_is_not_for_policy_kwargs(name: str, message: str) -> None:
+    with pytest.raises(ValueError, match=f"policy_kwargs with {name}=1: {message}"):
+        make_model(policy_kwargs={name: 1})
 
 
 def test_an_environment_with_other_spaces_is_refused_as_such() -> None:
@@ -228,14 +229,14 @@ def test_a_reward_that_is_not_finite_stops_training_and_tells_where(reward: floa
 
 def test_the_first_loss_to_break_is_named_before_those_that_follow() -> None:
     model = make_model().learn(20)
-    inner, calls = model.policy.dynamics.forward, []
+    inner, calls = model.policy.representation.dynamics.forward, []
 
     def break_at_the_third(z: th.Tensor, actions: th.Tensor) -> Any:
         calls.append(None)
         prediction = inner(z, actions)
         return prediction._replace(mean=prediction.mean * float("nan")) if len(calls) == 3 else prediction
 
-    model.policy.dynamics.forward = break_at_the_third  # type: ignore[method-assign]
+    model.policy.representation.dynamics.forward = break_at_the_third  # type: ignore[method-assign]
     third = model._n_updates + 3
     with pytest.raises(ValueError, match=rf"train/(dynamics|reward|bisim)_loss became nan at update {third}"):
         model.train(gradient_steps=10, batch_size=8)

@@ -121,8 +121,8 @@ def test_the_projector_holds_each_state_with_its_value_and_reward(tmp_path: Path
         buffer = model.replay_buffer
         assert buffer is not None
         obs = th.as_tensor(buffer.observations[:60, 0])
-        stored = model.critic.encode(obs)
-        q = model.critic.q_values(stored, model.actor(obs, deterministic=True))
+        stored = model.critic.features_extractor.encode(obs)
+        q = model.critic(obs, model.actor(obs, deterministic=True))
     rows_of_z = th.as_tensor(z).float()
     distance, nearest = (rows_of_z[:, None] - stored).norm(dim=-1).min(dim=1)
     assert distance.max() < 1e-5
@@ -175,7 +175,7 @@ def test_of_three_grey_frames_the_newest_becomes_a_grey_sprite() -> None:
 @pytest.mark.parametrize(("where", "expected"), [(slice(0, 2), 1.0), (slice(-2, None), 0.0)])
 def test_the_denoising_factor_tells_states_from_noise(where: slice, expected: float, tmp_path: Path) -> None:
     model = learn(None, None, steps=1)
-    model.critic.features_extractor.net = FlatEncoder(where)
+    model.critic.features_extractor.extractor.net = FlatEncoder(where)
     model.tensorboard_log = str(tmp_path)
     model.learn(1, DenoisingFactorCallback(n_states=300))
     assert scalars(tmp_path, "bisim/denoising_factor") == pytest.approx(expected, abs=0.15)
@@ -202,10 +202,10 @@ def test_exact_distances_keep_the_bound_and_a_collapsed_embedding_breaks_it(
         model = BisimSAC("CnnPolicy", env, gamma=0.9, distance="l1", tensorboard_log=str(tmp_path / str(scale)), **SETTINGS)
 
         def encode(obs: th.Tensor, scale: float = scale) -> th.Tensor:
-            return th.nn.functional.pad(scale * values[(obs[:, 0, 0, :1] / 20).long()], (0, 49))
+            return th.nn.functional.pad(scale * values[(255 * obs[:, 0, 0, :1] / 20).round().long()], (0, 49))
 
-        model.critic.encode = encode  # type: ignore[method-assign,assignment]
-        model.critic.q_values = lambda z, actions: (th.full((len(z), 1), 2.0),)  # type: ignore[method-assign]
+        model.critic.features_extractor.forward = encode  # type: ignore[method-assign,assignment]
+        model.critic.forward = lambda obs, actions: (th.full((len(actions), 1), 2.0),)  # type: ignore[method-assign]
         model.learn(1, ValueBoundCallback(n_states=30))
         found = {key: scalars(tmp_path / str(scale), f"bisim/value_{key}")[0] for key in ("gap", "bound", "bound_violations")}
         assert found["gap"] > 0

@@ -23,9 +23,9 @@ def nets(model: BisimSAC) -> dict[str, nn.Module]:
         "q_networks": nn.ModuleList(model.critic.q_networks),
         "critic_target": model.critic_target,
         "actor": nn.ModuleList([model.actor.latent_pi, model.actor.mu, model.actor.log_std]),
-        "dynamics": model.policy.dynamics,
-        "reward_model": model.policy.reward_model,
-        "inverse_dynamics": model.policy.inverse_dynamics,
+        "dynamics": model.policy.representation.dynamics,
+        "reward_model": model.policy.representation.reward_model,
+        "inverse_dynamics": model.policy.representation.inverse_dynamics,
     }
 
 
@@ -39,11 +39,10 @@ def with_gradient(model: BisimSAC) -> set[str]:
 
 
 def representation_losses(model: BisimSAC) -> dict[str, th.Tensor]:
-    batch = model.replay_buffer.sample(16)
-    z, next_z = model.critic.encode(batch.observations), model.critic.encode(batch.next_observations)
-    _, step = model._representation_losses(z, next_z, batch.actions, batch.rewards)
+    _, batch = model.policy.encode(model.replay_buffer.sample(16))
+    _, logged = model.policy.representation.losses(batch)
     model.policy.zero_grad()
-    return step
+    return logged
 
 
 @pytest.mark.parametrize("dynamics", ["deterministic", "probabilistic", "ensemble"])
@@ -64,10 +63,10 @@ def test_each_representation_loss_moves_the_encoder_and_its_own_model(loss: str,
 
 def test_the_inverse_loss_reaches_the_encoder_through_both_observations() -> None:
     model = trained()
-    batch = model.replay_buffer.sample(16)
-    z, next_z = (model.critic.encode(obs).detach().requires_grad_() for obs in (batch.observations, batch.next_observations))
-    _, step = model._representation_losses(z, next_z, batch.actions, batch.rewards)
-    step["train/inverse_dynamics_loss"].backward()
+    _, batch = model.policy.encode(model.replay_buffer.sample(16))
+    z, next_z = batch.z.detach().requires_grad_(), batch.next_z.detach().requires_grad_()
+    _, logged = model.policy.representation.losses(batch._replace(z=z, next_z=next_z))
+    logged["train/inverse_dynamics_loss"].backward()
     assert z.grad.abs().sum() > 0
     assert next_z.grad.abs().sum() > 0
 
@@ -76,7 +75,7 @@ def test_the_actor_loss_leaves_no_gradient_outside_the_actor() -> None:
     model = trained(policy_delay=1)
     before = {name: [param.clone() for param in net.parameters()] for name, net in nets(model).items()}
     # the other optimizers stand still: whatever moves was moved by the actor loss
-    for optimizer in (model.critic.optimizer, model.policy.inverse_dynamics.optimizer):
+    for optimizer in (model.critic.optimizer, model.policy.representation.inverse_dynamics.optimizer):
         optimizer.step = lambda: None
     model.tau = 0.0
     original = model.actor.optimizer.zero_grad
@@ -110,11 +109,14 @@ def test_an_actor_with_its_own_encoder_trains_that_one_alone() -> None:
 
 
 def test_training_moves_everything_and_the_target_follows() -> None:
-    model = trained(dynamics="probabilistic")
+    model = trained(dynamics="probabilistic", policy_delay=1)
     before = {name: [param.clone() for param in net.parameters()] for name, net in nets(model).items()}
-    model.train(gradient_steps=2, batch_size=16)
+    model.train(gradient_steps=1, batch_size=16)
     for name, net in nets(model).items():
         assert any(not th.equal(old, new) for old, new in zip(before[name], net.parameters(), strict=True)), name
+    after = list(model.critic.parameters())
+    for old, new, target in zip(before["critic_target"], after, model.critic_target.parameters(), strict=True):
+        th.testing.assert_close(target, old + model.tau * (new - old))
 
 
 def test_without_extras_only_sac_and_its_encoder_learn() -> None:

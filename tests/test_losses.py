@@ -23,7 +23,7 @@ def test_w2_of_diagonal_gaussians_is_the_optimal_transport_of_pot(seed: int, n: 
     mean_i, mean_j, raw_i, raw_j = normal(4, n, seed=seed)
     std_i, std_j = raw_i.exp(), raw_j.exp()
     expected = ot.gaussian.bures_wasserstein_distance(mean_i, mean_j, th.diag(std_i**2), th.diag(std_j**2))
-    distance = losses.gaussian_w2(mean_i[None], std_i[None], mean_j[None], std_j[None])
+    distance = losses.pairwise_distance(mean_i[None], mean_j[None], "l2", std_i[None], std_j[None])
     assert distance.shape == (1, 1)
     assert distance.item() == pytest.approx(float(expected), rel=1e-6, abs=1e-6)
 
@@ -37,15 +37,15 @@ def test_w2_of_each_coordinate_is_that_of_one_dimensional_gaussians() -> None:
         )
         for row in zip(mean_i, mean_j, std_i, std_j, strict=True)
     ]
-    arguments = mean_i[None], std_i[None], mean_j[None], std_j[None]
-    np.testing.assert_allclose(losses.gaussian_w2(*arguments, distance="huber")[0], expected)
-    assert losses.gaussian_w2(*arguments, distance="l1").item() == pytest.approx(sum(expected))
+    (means, stds) = (mean_i[None], mean_j[None]), (std_i[None], std_j[None])
+    np.testing.assert_allclose(losses.pairwise_distance(*means, "huber", *stds)[0], expected)
+    assert losses.pairwise_distance(*means, "l1", *stds).item() == pytest.approx(sum(expected))
 
 
 def test_w2_of_equal_spreads_is_the_distance_of_the_means() -> None:
     mean_i, mean_j, std = normal(3, 4, 6)
     for distance in ("l1", "l2"):
-        w2 = losses.gaussian_w2(mean_i, std.exp(), mean_j, std.exp(), distance)
+        w2 = losses.pairwise_distance(mean_i, mean_j, distance, std.exp(), std.exp())
         th.testing.assert_close(w2, losses.pairwise_distance(mean_i, mean_j, distance))
 
 
@@ -78,7 +78,7 @@ def test_what_would_be_taken_for_something_else_is_refused() -> None:
     with pytest.raises(ValueError, match="distance='cosine'"):
         losses.pairwise_distance(x, x, "cosine")
     with pytest.raises(ValueError, match="distance='cosine'"):
-        losses.gaussian_w2(x, x, x, x, "cosine")
+        losses.pairwise_distance(x, x, "cosine", x, x)
     with pytest.raises(ValueError, match="kind='gaussian'"):
         DynamicsModel(3, 1, "gaussian", None)
 

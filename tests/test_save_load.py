@@ -19,7 +19,13 @@ from sb3_robust_bisim import BisimSAC, IntrinsicRewardVecEnv
 from sb3_robust_bisim.policies import MlpPolicy
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
-STATE_DICTS = {"policy", "actor.optimizer", "critic.optimizer", "ent_coef_optimizer", "policy.inverse_dynamics.optimizer"}
+STATE_DICTS = {
+    "policy",
+    "actor.optimizer",
+    "critic.optimizer",
+    "ent_coef_optimizer",
+    "policy.representation.inverse_dynamics.optimizer",
+}
 
 
 def make_model(**kwargs: Any) -> Any:
@@ -52,10 +58,15 @@ def bonus_layers(model: Any) -> list[IntrinsicRewardVecEnv]:
 
 
 def bonuses(model: Any, steps: int = 3) -> list[float | None]:
-    """What the environment of the model pays beside the reward, None where no bonus is bound."""
-    env = model.get_env()
-    env.reset()
-    return [env.step(np.ones((1, 1), dtype=np.float32))[3][0].get("intrinsic_reward") for _ in range(steps)]
+    """What the environment pays beside the reward while the model learns, None where no bonus is bound."""
+    paid: list[float | None] = []
+
+    def note(found: dict[str, Any], _: dict[str, Any]) -> bool:
+        paid.append(found["infos"][0].get("intrinsic_reward"))
+        return True
+
+    model.learn(steps, reset_num_timesteps=False, callback=note)
+    return paid
 
 
 def assert_same(left: Any, right: Any) -> None:
@@ -94,16 +105,15 @@ def test_a_loaded_model_learns_on_with_one_bonus_and_no_second_burst(trained: An
     assert all(value is not None for value in bonuses(loaded))
 
 
-def test_set_env_binds_the_bonus_once_to_the_model_that_has_the_environment() -> None:
+def test_set_env_takes_the_wrapper_that_is_there_and_each_model_learns_from_its_own_bonus() -> None:
     first, env = make_model(), IntrinsicRewardVecEnv(DummyVecEnv([pendulum]))
     for _ in range(2):
         first.set_env(env)
         assert bonus_layers(first) == [env]
+    clamped, without = make_model(env=env, intrinsic_reward_max=0.0), make_model(env=env, intrinsic_reward_scale=0.0)
+    assert bonuses(clamped) == [0.0] * 3
+    assert bonuses(without) == [None] * 3
     assert all(bonuses(first))
-    make_model(env=env, intrinsic_reward_max=0.0)
-    assert bonuses(first) == [0.0] * 3  # the environment is the second model's now
-    make_model(env=env, intrinsic_reward_scale=0.0)
-    assert bonuses(first) == [None] * 3
 
 
 def test_set_env_moves_to_a_vecnormalize_with_the_bonus_inside() -> None:
@@ -149,26 +159,25 @@ def test_a_fresh_process_takes_over_where_training_stopped(trained: Any, saved: 
 )
 def test_a_changed_argument_at_load_reaches_every_net(saved: Path, argument: str, value: Any, radius: float | None) -> None:
     loaded: Any = BisimSAC.load(saved, env=pendulum(), **{argument: value})
-    nets = (loaded.policy, loaded.actor, loaded.critic, loaded.critic_target, loaded.policy.dynamics)
-    for net in (loaded, *nets):
-        assert net.radius == (None if radius is None else pytest.approx(radius))
+    encoders = (net.features_extractor for net in (loaded.actor, loaded.critic, loaded.critic_target))
+    for holder in (loaded, *encoders, loaded.policy.representation.dynamics):
+        assert holder.radius == (None if radius is None else pytest.approx(radius))
     loaded.learn(2, reset_num_timesteps=False)
     if radius == 1.0:
         far = th.as_tensor(1e4 * OBSERVATIONS, device=loaded.device)
-        assert loaded.critic.encode(far).norm(dim=1).max().item() == pytest.approx(1.0)
+        assert loaded.critic.features_extractor.encode(far).norm(dim=1).max().item() == pytest.approx(1.0)
 
 
 def test_extras_can_be_switched_at_load(saved: Path) -> None:
     off: Any = BisimSAC.load(saved, env=pendulum(), intrinsic_reward_scale=0.0, inverse_dynamics_coef=0.0)
+    before = off.policy.representation.inverse_dynamics.net[0].weight.detach().clone()
     assert bonuses(off) == [None] * 3
-    before = off.policy.inverse_dynamics.net[0].weight.detach().clone()
-    off.learn(3, reset_num_timesteps=False)
-    assert_same(off.policy.inverse_dynamics.net[0].weight, before)
+    assert_same(off.policy.representation.inverse_dynamics.net[0].weight, before)
     off.save(saved)
     on: Any = BisimSAC.load(saved, env=pendulum(), intrinsic_reward_scale=1.0, inverse_dynamics_coef=1.0)
     assert all(bonuses(on))
     on.learn(3, reset_num_timesteps=False)
-    assert not th.equal(on.policy.inverse_dynamics.net[0].weight, before)
+    assert not th.equal(on.policy.representation.inverse_dynamics.net[0].weight, before)
 
 
 @pytest.mark.parametrize("dynamics", ["probabilistic", "ensemble"])
@@ -196,7 +205,7 @@ def test_the_policy_alone_comes_back(trained: Any, tmp_path: Path) -> None:
     policy = MlpPolicy.load(str(tmp_path / "policy.pkl"), device=trained.device)
     np.testing.assert_array_equal(actions_of(policy), actions_of(trained))
     assert_same(policy.state_dict(), trained.policy.state_dict())
-    assert policy.radius == policy.critic.radius == trained.radius
+    assert policy.critic.features_extractor.radius == trained.radius
 
 
 def test_parameters_travel_between_models_and_must_be_complete(trained: Any) -> None:
@@ -225,7 +234,7 @@ def test_no_net_is_pickled_beside_the_state_dicts(saved: Path) -> None:
     assert names == {"data", "pytorch_variables", "_stable_baselines3_version", "system_info.txt"} | STATE_DICTS
     assert not {"policy", "actor", "critic", "critic_target", "replay_buffer", "env"} & data.keys()
     assert data["policy_kwargs"].keys() >= {"net_arch"}
-    assert "radius" not in data["policy_kwargs"]
+    assert "objective" not in data["policy_kwargs"]
     assert len(json.dumps(data)) < 60_000  # spaces and pickled small classes, no weights
 
 

@@ -156,8 +156,7 @@ def test_dict_observations_train_with_the_multi_input_policy() -> None:
     assert model._n_updates == 3
     obs, _ = env.reset()
     assert model.predict(obs)[0].shape == (4,)
-    _, _, _, infos = model.get_env().step(np.zeros((1, 4), dtype=np.float32))
-    assert infos[0]["intrinsic_reward"] > 0
+    assert model.logger.name_to_value["rollout/intrinsic_reward"] > 0
 
 
 def test_actions_of_any_shape_train() -> None:
@@ -239,15 +238,15 @@ class NormDropout(BaseFeaturesExtractor):
 def test_batch_norm_and_dropout_act_in_training_alone(share: bool) -> None:
     policy_kwargs = dict(net_arch=[16], features_extractor_class=NormDropout, share_features_extractor=share)
     model = with_data(policy_kwargs=policy_kwargs, tau=0.0, target_update_interval=2)
-    norm, target_norm = model.critic.features_extractor.norm, model.critic_target.features_extractor.norm
-    actor_norm = model.actor.features_extractor.norm
+    nets = (model.critic, model.critic_target, model.actor)
+    norm, target_norm, actor_norm = (net.features_extractor.extractor.norm for net in nets)
     assert norm.running_mean.eq(0).all()  # acting and the bonus leave the statistics alone
     obs = np.ones((4, 3), dtype=np.float32)
     np.testing.assert_array_equal(model.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
 
     model.train(1, batch_size=8)
     assert model.policy.training
-    assert model.policy.dynamics.training
+    assert model.policy.representation.dynamics.training
     assert not model.critic_target.features_extractor.training
     assert norm.running_mean.ne(0).all()
     assert actor_norm.running_mean.ne(0).all()
@@ -259,7 +258,7 @@ def test_batch_norm_and_dropout_act_in_training_alone(share: bool) -> None:
     model.learn(EPISODE)
     model.predict(obs)
     assert not model.policy.training
-    assert not model.policy.dynamics.training
+    assert not model.policy.representation.dynamics.training
     th.testing.assert_close((norm.running_mean, actor_norm.running_mean), before, rtol=0, atol=0)
 
 
@@ -329,7 +328,7 @@ def test_the_schedule_reaches_every_optimizer_but_that_of_the_inverse_dynamics()
     assert [learning_rate_of(optimizer) for optimizer in optimizers] == [2e-3] * 3
     model.learn(2 * EPISODE)
     assert [learning_rate_of(optimizer) for optimizer in optimizers] == [1e-3] * 3
-    assert learning_rate_of(model.policy.inverse_dynamics.optimizer) == 1e-4
+    assert learning_rate_of(model.policy.representation.inverse_dynamics.optimizer) == 1e-4
 
 
 def test_delays_count_all_updates_also_at_one_gradient_step_per_call() -> None:
@@ -363,10 +362,15 @@ def test_images_that_are_floats_already_are_encoded_as_they_are() -> None:
     env = FloatImages(FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False, channel_first=True))
     policy_kwargs = dict(normalize_images=False, net_arch=[16])
     model = BisimSAC("CnnPolicy", env, buffer_size=50, learning_starts=10, batch_size=4, policy_kwargs=policy_kwargs).learn(14)
-    assert type(model.critic.features_extractor).__name__ == "PixelEncoder"
+    encoder, seen = model.critic.features_extractor, []
+    encoder.extractor.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
+    obs = th.rand(2, 1, 36, 36)
+    encoder.encode(obs)
+    assert th.equal(seen[0], obs)  # not divided by 255
 
 
 def test_one_setting_of_the_inverse_dynamics_optimizer_leaves_the_others() -> None:
     policy_kwargs = dict(inverse_dynamics_optimizer_kwargs=dict(weight_decay=0.0, foreach=True), net_arch=[16])
-    group = BisimSAC("MlpPolicy", "Pendulum-v1", policy_kwargs=policy_kwargs).policy.inverse_dynamics.optimizer.param_groups[0]
+    policy = BisimSAC("MlpPolicy", "Pendulum-v1", policy_kwargs=policy_kwargs).policy
+    group = policy.representation.inverse_dynamics.optimizer.param_groups[0]
     assert (group["lr"], group["weight_decay"], group["foreach"]) == (1e-4, 0.0, True)

@@ -37,6 +37,10 @@ def model_with_a_batch(**kwargs: Any) -> tuple[BisimSAC, Any]:
     return model, batch
 
 
+def q_values(critic: Any, z: th.Tensor, actions: th.Tensor) -> list[th.Tensor]:
+    return [q_net(th.cat([z, actions], dim=1)) for q_net in critic.q_networks]
+
+
 def descended(loss: th.Tensor, params: list[th.Tensor]) -> list[th.Tensor]:
     return [param - LEARNING_RATE * grad for param, grad in zip(params, th.autograd.grad(loss, params), strict=True)]
 
@@ -54,26 +58,26 @@ def test_an_update_is_that_of_the_equations(dynamics: str) -> None:
     logged = model.logger.name_to_value
 
     th.manual_seed(1)  # next actions, a sample of the model, pairs and actions are drawn in this order
-    z, next_z = old.critic.encode(obs), old.critic.encode(next_obs)
+    z, next_z = old.critic.features_extractor.encode(obs), old.critic.features_extractor.encode(next_obs)
     with th.no_grad():
         next_actions, next_log_prob = old.actor.action_log_prob(next_obs)
         next_q = th.minimum(*old.critic_target(next_obs, next_actions)) - ALPHA * next_log_prob[:, None]
         target = rewards + GAMMA * (1 - dones) * next_q
     critic_loss = sum((q - target).square().mean() for q in old.critic(obs, actions))
-    mean, std = (None if moment is None else moment[0] for moment in old.dynamics(z, actions))
+    mean, std = (None if moment is None else moment[0] for moment in old.representation.dynamics(z, actions))
     sampled, spread, error = mean, 0.0, (mean - next_z.detach()).square() / 2
     if std is not None:
         sampled = mean + std * th.randn_like(mean)
         sampled = sampled * (model.radius / sampled.norm(dim=1, keepdim=True)).clamp(max=1)
         error = error / std.square() + std.log()
-    dynamics_loss, reward_loss = error.mean(), (old.reward_model(sampled) - rewards).square().mean()
+    dynamics_loss, reward_loss = error.mean(), (old.representation.reward_model(sampled) - rewards).square().mean()
     other = th.randperm(len(z))
     if std is not None:
         spread = (std - std[other]).square().sum(dim=1)
     gap = (mean - mean[other]).square().sum(dim=1).add(spread).sqrt()
     wanted = (C_R * (rewards - rewards[other]).abs()[:, 0] + C_T * gap).detach()
     bisim_loss = ((z - z[other]).norm(dim=1) - wanted).square().mean()  # norm: some are paired with themselves
-    inverse_dynamics_loss = (old.inverse_dynamics(z, next_z) - actions).abs().mean()
+    inverse_dynamics_loss = (old.representation.inverse_dynamics(z, next_z) - actions).abs().mean()
     names = ("critic_loss", "dynamics_loss", "reward_loss", "bisim_loss", "inverse_dynamics_loss")
     terms = (critic_loss, dynamics_loss, reward_loss, bisim_loss, inverse_dynamics_loss)
     for name, term in zip(names, terms, strict=True):
@@ -81,12 +85,12 @@ def test_an_update_is_that_of_the_equations(dynamics: str) -> None:
 
     total = critic_loss + MODEL_COEF * (dynamics_loss + reward_loss) + BISIM_COEF * bisim_loss
     total = total + INVERSE_DYNAMICS_COEF * inverse_dynamics_loss
-    trained = [[*policy.critic.parameters(), *policy.dynamics.parameters()] for policy in (model.policy, old)]
+    trained = [[*policy.critic.parameters(), *policy.representation.dynamics.parameters()] for policy in (model.policy, old)]
     assert_close(trained[0], descended(total, trained[1]))
 
     # the actor sees the new critics, on the embedding that the old encoder gave
     sampled_actions, log_prob = old.actor.action_log_prob(obs)
-    q = th.minimum(*model.critic.q_values(z.detach(), sampled_actions))
+    q = th.minimum(*q_values(model.critic, z.detach(), sampled_actions))
     actor_loss = (ALPHA * log_prob[:, None] - q).mean()
     assert logged["train/actor_loss"] == pytest.approx(actor_loss.item(), rel=1e-4)
     assert_close(model.policy.actor_parameters(), descended(actor_loss, old.actor_parameters()))

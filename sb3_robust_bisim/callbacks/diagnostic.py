@@ -17,6 +17,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack
 
 from sb3_robust_bisim.bisim_sac import BisimSAC
+from sb3_robust_bisim.encoders import Encoded
 from sb3_robust_bisim.frame_buffer import frames_per_observation
 
 LONGEST_WALK = 100_000  # steps of one look, far more than it takes where episodes end
@@ -190,9 +191,10 @@ def embed(model: BisimSAC, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
     :param obs: B observations as the networks take them
     :return: (B, n) embeddings and (B, 1) values, min_k Q_k(s, mean action)
     """
-    z = model.critic.encode(obs)
-    actions = model.actor(obs, deterministic=True)
-    return z, th.cat(model.critic.q_values(z, actions), dim=1).min(dim=1, keepdim=True).values
+    encoder = model.critic.features_extractor
+    encoded = Encoded(encoder.preprocess(obs))
+    actions = model.actor(encoded, deterministic=True)
+    return encoded[encoder], th.cat(model.critic(encoded, actions), dim=1).min(dim=1, keepdim=True).values
 
 
 @contextmanager

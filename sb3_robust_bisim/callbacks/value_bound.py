@@ -51,7 +51,7 @@ class ValueBoundCallback(EnvironmentCallback):
         distance = pairwise_distance(z[first], z[second], self.model.distance).mean(dim=1).cpu().double().numpy()
         gap = np.abs(returns[keep][first] - returns[keep][second])
         r_min, r_max = self.model.reward_range
-        bound = self._bound(distance, self.model.c_r, self.model._c_t, self.model.gamma, r_max - r_min)
+        bound = self._bound(distance, self.model.c_r, self.model.policy.objective.c_t, self.model.gamma, r_max - r_min)
         self.logger.record("bisim/value_bound_violations", float((gap > bound).mean()))
         self.logger.record("bisim/value_gap", float(gap.mean()))
         self.logger.record("bisim/value_bound", float(bound.mean()))

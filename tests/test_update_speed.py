@@ -13,7 +13,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_robust_bisim import BisimSAC
-from sb3_robust_bisim.fast_paths import unchecked_distributions
+from sb3_robust_bisim.policies import unchecked_distributions
 
 ENV = "robust_bisim/SparseCartPole-v0"
 EVERYTHING: dict[str, Any] = dict(
@@ -87,7 +87,7 @@ def test_bf16_encodes_almost_the_same_and_learns_in_fp32() -> None:
     fp32, bf16 = (BisimSAC("CnnPolicy", make_env(), buffer_size=100, bf16=on, **EVERYTHING) for on in (False, True))
     obs = fp32.policy.obs_to_tensor(np.stack([make_env().observation_space.sample() for _ in range(8)]))[0]
     with th.no_grad():
-        exact, rounded = fp32.critic.encode(obs), bf16.critic.encode(obs)
+        exact, rounded = fp32.critic.features_extractor.encode(obs), bf16.critic.features_extractor.encode(obs)
     assert rounded.dtype == th.float32
     assert not th.equal(exact, rounded)
     assert (exact - rounded).norm() / exact.norm() < 0.05

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
+import sb3_robust_bisim.theory.finite_mdp as solver
 from sb3_robust_bisim.theory import (
     Array,
     FiniteMDP,
@@ -140,6 +141,30 @@ class TestMetric:
 
         with pytest.raises(RuntimeError, match=r"tol=1e-300 is lost in rounding.*larger tol"):
             solve_to_the_last_bit()
+
+    @pytest.mark.parametrize("p", [1.0, 2.0])
+    @pytest.mark.parametrize("c_t", [0.99, 0.999])
+    def test_gives_up_within_a_few_sweeps_when_rounding_stands_in_the_way(
+        self, c_t: float, p: float, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(solver, "MAX_SWEEPS", 50)
+        sweeps, find_couplings = 0, solver._couplings
+
+        def count_and_find(*arguments: Any) -> Any:
+            nonlocal sweeps
+            sweeps += 1
+            return find_couplings(*arguments)
+
+        def solve_with_large_rewards() -> None:
+            nonlocal sweeps
+            for seed in range(30):  # a residual may also end at exactly 0
+                rng, sweeps = np.random.default_rng(seed), 0
+                bisimulation_metric(FiniteMDP(rng.dirichlet(np.ones(6), size=(6, 1)), 1e8 * rng.random((6, 1))), 1.0, c_t, p)
+
+        monkeypatch.setattr(solver, "_couplings", count_and_find)
+        with pytest.raises(RuntimeError, match="lost in rounding"):
+            solve_with_large_rewards()
+        assert sweeps < 20
 
 
 class TestSolvedByHand:

@@ -11,12 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
+import sb3_robust_bisim.theory.finite_mdp as solver
 from sb3_robust_bisim.theory import (
     Array,
     FiniteMDP,
     aggregate,
     bisimulation_metric,
     distance_moments,
+    mico_distance,
     policy_bisimulation_metric,
     policy_evaluation,
     stationary_distribution,
@@ -141,6 +143,30 @@ class TestMetric:
         with pytest.raises(RuntimeError, match=r"tol=1e-300 is lost in rounding.*larger tol"):
             solve_to_the_last_bit()
 
+    @pytest.mark.parametrize("p", [1.0, 2.0])
+    @pytest.mark.parametrize("c_t", [0.99, 0.999])
+    def test_gives_up_within_a_few_sweeps_when_rounding_stands_in_the_way(
+        self, c_t: float, p: float, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(solver, "MAX_SWEEPS", 50)
+        sweeps, find_couplings = 0, solver._couplings
+
+        def count_and_find(*arguments: Any) -> Any:
+            nonlocal sweeps
+            sweeps += 1
+            return find_couplings(*arguments)
+
+        def solve_with_large_rewards() -> None:
+            nonlocal sweeps
+            for seed in range(30):  # a residual may also end at exactly 0
+                rng, sweeps = np.random.default_rng(seed), 0
+                bisimulation_metric(FiniteMDP(rng.dirichlet(np.ones(6), size=(6, 1)), 1e8 * rng.random((6, 1))), 1.0, c_t, p)
+
+        monkeypatch.setattr(solver, "_couplings", count_and_find)
+        with pytest.raises(RuntimeError, match="lost in rounding"):
+            solve_with_large_rewards()
+        assert sweeps < 20
+
 
 class TestSolvedByHand:
     @MANY
@@ -189,6 +215,64 @@ class TestSolvedByHand:
 
     def test_constant_rewards_collapse_the_metric(self) -> None:
         np.testing.assert_array_equal(policy_bisimulation_metric(*chain([[0, 1], [1, 0]], [5, 5]), 1.0, 0.9), 0.0)
+
+
+def test_a_metric_need_not_be_unique_where_distances_are_unbounded() -> None:
+    # The chain s -> s + 1 without rewards: d(i, j) = c_T d(i + 1, j + 1) holds for 0 and for this one.
+    c_t, state = 0.5, np.arange(20.0)
+    distance = np.abs(np.subtract.outer(c_t**-state, c_t**-state))
+    np.testing.assert_array_equal(distance[:-1, :-1], c_t * distance[1:, 1:])
+
+
+class TestMICo:
+    def test_of_two_states_with_the_same_random_successor(self) -> None:
+        # The mean m over two uniform states solves m = 0.5 + 0.9 m.
+        distance = mico_distance(*chain([[0.5, 0.5], [0.5, 0.5]], [0, 1]), 1.0, 0.9)
+        np.testing.assert_allclose(distance, [[4.5, 5.5], [5.5, 4.5]])
+
+    def test_of_a_chain_that_is_absorbed_with_chance_q(self) -> None:
+        q, c_r, c_t = 0.3, 2.0, 0.9
+        stays = 1 - q
+        between = c_r / (1 - c_t * stays)
+        itself = 2 * c_t * q * stays * between / (1 - c_t * stays**2)
+        distance = mico_distance(*chain([[stays, q], [0, 1]], [0, 1]), c_r, c_t)
+        np.testing.assert_allclose(distance, [[itself, between], [between, 0]])
+
+    @FEW
+    @given(mdps_with_policy(), REWARD_WEIGHTS, TRANSITION_WEIGHTS, st.integers(0, 5))
+    def test_iteration_from_anywhere_comes_closer_by_c_t_each_time(
+        self, drawn: tuple[FiniteMDP, Array], c_r: float, c_t: float, seed: int
+    ) -> None:
+        reward_process = drawn[0].under(drawn[1])
+        rows, gap = reward_process.transition[:, 0], c_r * np.abs(reward_process.reward - reward_process.reward.T)
+        distance = mico_distance(*drawn, c_r, c_t)
+        iterate = 5 * np.random.default_rng(seed).random(gap.shape)
+        error = np.abs(iterate - distance).max()
+        for _ in range(300):
+            iterate = gap + c_t * np.einsum("ik,jl,kl->ij", rows, rows, iterate)
+            assert np.abs(iterate - distance).max() <= c_t * error + 1e-12
+            error = np.abs(iterate - distance).max()
+        np.testing.assert_allclose(iterate, distance, atol=1e-11)
+
+    @MANY
+    @given(mdps_with_policy(), REWARD_WEIGHTS, TRANSITION_WEIGHTS)
+    def test_is_a_diffuse_metric_between_the_bisimulation_metric_and_the_diameter(
+        self, drawn: tuple[FiniteMDP, Array], c_r: float, c_t: float
+    ) -> None:
+        distance = mico_distance(*drawn, c_r, c_t)
+        np.testing.assert_array_equal(distance, distance.T)
+        assert (distance[:, None, :] <= distance[:, :, None] + distance[None, :, :] + 1e-9).all()
+        assert (policy_bisimulation_metric(*drawn, c_r, c_t) <= distance + 1e-6).all()
+        assert distance.max() <= c_r * np.ptp(drawn[0].under(drawn[1]).reward) / (1 - c_t) + 1e-9
+
+    @FEW
+    @given(mdps_with_policy(deterministic=True), TRANSITION_WEIGHTS)
+    def test_is_the_bisimulation_metric_of_a_deterministic_chain(self, drawn: tuple[FiniteMDP, Array], c_t: float) -> None:
+        np.testing.assert_allclose(mico_distance(*drawn, 2.0, c_t), policy_bisimulation_metric(*drawn, 2.0, c_t), atol=2e-8)
+
+    def test_refuses_weights_without_a_fixed_point(self) -> None:
+        with pytest.raises(ValueError, match=re.escape("c_t is 1.0")):
+            mico_distance(SWITCH, np.full((2, 2), 0.5), 1.0, 1.0)
 
 
 class TestPolicyIndependentMetric:

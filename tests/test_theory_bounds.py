@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch as th
 from finite_mdps import (
     DISCOUNTS,
     FEW,
@@ -21,6 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from sb3_robust_bisim.losses import ball_radius, bisim_loss, project_to_ball
 from sb3_robust_bisim.theory import (
     Array,
     FiniteMDP,
@@ -99,6 +101,17 @@ class TestDiameter:
 
     def test_is_reached_by_states_that_never_change(self) -> None:
         assert bisimulation_metric(THREE_APART, 1.0, 0.9).max() == pytest.approx(diameter_bound(THREE_APART, 1.0, 0.9))
+
+
+@pytest.mark.parametrize("shrunk", [0.0, 0.8])
+def test_ball_leaves_the_metric_loss_two_fixed_points_when_predictions_grow(shrunk: float) -> None:
+    c_t, k = 0.8, 1.5
+    radius = ball_radius(1.0, c_t, (0.0, 1.0))
+    z = shrunk * radius * th.tensor([[1.0, 0.0], [-1.0, 0.0]])
+    no_rewards, others = th.zeros(2, 1), th.tensor([1, 0])
+    loss, mean_distance, _ = bisim_loss(z, no_rewards, project_to_ball(k * z, radius), None, others, 1.0, c_t, "l2")
+    assert loss.item() == pytest.approx(0.0, abs=1e-9)
+    assert mean_distance.item() == pytest.approx(2 * shrunk * radius)
 
 
 class TestValueDifference:

@@ -11,6 +11,7 @@ from sb3_robust_bisim.theory import (
     FiniteMDP,
     bisimulation_metric,
     distance_moments,
+    mico_distance,
     policy_bisimulation_metric,
     stationary_distribution,
 )
@@ -34,6 +35,14 @@ class TestMeanDistance:
         rho = stationary_distribution(setting.mdp, setting.policy)
         bound = mean_distance(distance_moments(setting.reward_gap(), rho)[0], setting.c_r, setting.c_t)
         assert distance_moments(setting.metric, rho)[0] <= bound + SLACK
+
+    @MANY
+    @given(settings_of())
+    def test_lemma_mean_lemma_is_an_equality_for_mico_on_every_chain(self, setting: Setting) -> None:
+        rho = stationary_distribution(setting.mdp, setting.policy)
+        expected = mean_distance(distance_moments(setting.reward_gap(), rho)[0], setting.c_r, setting.c_t)
+        distance = mico_distance(setting.mdp, setting.policy, setting.c_r, setting.c_t)
+        assert distance_moments(distance, rho)[0] == pytest.approx(expected, abs=SLACK)
 
     def test_stochastic_policy_in_a_deterministic_environment_breaks_the_equality(self) -> None:
         mdp = FiniteMDP(np.array([np.eye(2), np.eye(2)]), np.array([[0.0, 0.0], [1.0, 1.0]]))  # action a leads to state a
@@ -62,10 +71,19 @@ class TestMeanAndVariance:
     def test_mean_bound_of_corollary_meanvar_holds_on_policy_for_independent_states(
         self, setting: Setting, data: st.DataObject
     ) -> None:
-        setting.p = 1.0
         rho = data.draw(distributions(1, setting.mdp.n_states))[0]
         bound, _ = mean_variance_bound(setting.mdp, setting.c_r, setting.c_t)
-        assert distance_moments(setting.metric, rho)[0] <= bound + SLACK
+        upper = mico_distance(setting.mdp, setting.policy, setting.c_r, setting.c_t)  # of the metric with p = 1
+        assert distance_moments(upper, rho)[0] <= bound + SLACK
+
+    @MANY
+    @given(settings_of(), st.data())
+    def test_ball_has_room_for_every_on_policy_metric_that_embeds_in_l2(self, setting: Setting, data: st.DataObject) -> None:
+        setting.p = 1.0
+        rho = data.draw(distributions(1, setting.mdp.n_states))[0]
+        radius, _ = mean_variance_bound(setting.mdp, setting.c_r, setting.c_t)  # half the diameter
+        # The squared radius of the smallest ball around points is the largest such mean, over all distributions.
+        assert rho @ setting.metric**2 @ rho / 2 <= radius**2 + 100 * SLACK
 
     @MANY
     @given(settings_of(), st.data())
@@ -94,12 +112,15 @@ class TestMeanAndVariance:
         assert policy_bisimulation_metric(*never_changes, 1.0, 0.9)[0, 1] == pytest.approx(10.0)  # the pair is always (0, 1)
         assert mean_variance_bound(never_changes[0], 1.0, 0.9)[0] == pytest.approx(5.0)
 
-    def test_mean_of_an_on_policy_metric_exceeds_the_bound_when_p_is_four(self) -> None:
-        lazy = chain([[0.99, 0, 0.01], [0, 1, 0], [0.01, 0, 0.99]], [1, 0, 0])
-        rho = stationary_distribution(*lazy)
-        mean, _ = distance_moments(policy_bisimulation_metric(*lazy, 1.0, 0.9, p=4), rho)
-        assert mean == pytest.approx(5.104, abs=1e-3)
-        assert mean_variance_bound(lazy[0], 1.0, 0.9)[0] == pytest.approx(5.0)
+    @pytest.mark.parametrize(("p", "rare", "expected"), [(2, 0.01, 5.277), (1.1, 1e-5, 5.00007)])
+    def test_mean_of_an_on_policy_metric_exceeds_the_bound_when_p_is_above_one(
+        self, p: float, rare: float, expected: float
+    ) -> None:
+        stays = 1 - rare
+        swap = chain([[stays, 0, rare, 0], [0, 1, 0, 0], [rare, 0, stays, 0], [0, 0, 0, 1]], [1, 0, 0, 1])
+        mean, _ = distance_moments(policy_bisimulation_metric(*swap, 1.0, 0.9, p), stationary_distribution(*swap))
+        assert mean == pytest.approx(expected, abs=1e-2 * (expected - 5))
+        assert mean_variance_bound(swap[0], 1.0, 0.9)[0] == pytest.approx(5.0)
 
 
 class TestVarianceOnPolicy:
@@ -116,15 +137,16 @@ class TestVarianceOnPolicy:
     def test_prop_prop4_at_one_half_is_four_times_the_variance_of_the_reward_gap(self) -> None:
         assert policy_variance_bound(123.0, 0.25, 3.0, 0.5) == pytest.approx(4 * 9 * 0.25)
 
-    def test_stochastic_policy_in_a_deterministic_environment_breaks_it(self) -> None:
+    @pytest.mark.parametrize(("p", "expected"), [(1, 0.7744), (2, 0.7768)])
+    def test_stochastic_policy_in_a_deterministic_environment_breaks_it(self, p: float, expected: float) -> None:
         # Action a leads states 0 and 1 to state 2, and state 2 to state a.
         transition = np.eye(3)[np.array([[2, 2], [2, 2], [0, 1]])]
         mdp = FiniteMDP(transition, np.array([[1.0, 1.0], [0.8, 0.8], [0.0, 0.0]]))
         policy = np.full((3, 2), 0.5)
         rho = stationary_distribution(mdp, policy)
-        _, variance = distance_moments(policy_bisimulation_metric(mdp, policy, 1.0, 0.5), rho)
+        _, variance = distance_moments(policy_bisimulation_metric(mdp, policy, 1.0, 0.5, p), rho)
         moments = distance_moments(np.abs(mdp.under(policy).reward - mdp.under(policy).reward.T), rho)
-        assert variance == pytest.approx(0.7744, abs=1e-4)
+        assert variance == pytest.approx(expected, abs=1e-4)
         assert policy_variance_bound(*moments, 1.0, 0.5) == pytest.approx(0.7575, abs=1e-4)
 
     def test_states_not_from_the_stationary_distribution_break_it(self) -> None:

@@ -1,7 +1,8 @@
 """The paper's bounds on bisimulation metrics and value functions, one function each, with the conditions that they need.
 
 Equation labels are those of Kemertas and Aumentado-Armstrong, "Towards Robust Bisimulation Metric Learning" (NeurIPS 2021).
-Where the paper states more than is true, the docstring gives the condition that is needed and docs/theory.md a counterexample.
+Each docstring gives the conditions that are needed. docs/theory.md has an example of what happens without them, and says which
+of them the paper assumes.
 Weights outside their ranges (c_R >= 0, 0 <= c_T < 1, 0 <= gamma < 1), and negative errors or spans, raise ValueError.
 """
 
@@ -46,8 +47,8 @@ def value_difference_bound(distance: Array, c_r: float, c_t: float, gamma: float
 def aggregation_value_bound(epsilon: float, c_r: float, c_t: float, gamma: float, reward_span: float = 1.0) -> float:
     """``thm:generalized-ct-vfa``: an upper bound of |V^pi(s) - V~^pi(Phi(s))| in every state.
 
-    Holds for p >= 1 if any two states of a cell are at most 2 epsilon apart and V~^pi is the value of the chain
-    :func:`~sb3_robust_bisim.theory.aggregate` makes, with any weights. It fails for the MDP averaged action by action when
+    Holds for p >= 1 if any two states of a cell are at most 2 epsilon apart and V~^pi is the value of the chain that
+    :func:`~sb3_robust_bisim.theory.aggregate` makes, with any weights. It can fail for the MDP averaged action by action when
     the policy differs inside a cell. Rewards as for :func:`value_difference_bound`.
 
     :param epsilon: half of the largest distance d_pi inside a cell.
@@ -95,8 +96,8 @@ def model_error_value_bound(
 ) -> float:
     """``theorem:valboundmodelerror`` and, where c_T < gamma, ``crl:vfamodelerrorct``: bounds |V^pi(s) - V~^pi(Phi(s))|.
 
-    V~^pi is the value of the true chain, averaged over cells by :func:`~sb3_robust_bisim.theory.aggregate`. Holds for every
-    p >= 1, see :func:`metric_error_bound`; rewards as for :func:`value_difference_bound`.
+    V~^pi is the value of the true chain, averaged by :func:`~sb3_robust_bisim.theory.aggregate` over cells that the learned
+    distance makes. Holds for every p >= 1, see :func:`metric_error_bound`; rewards as for :func:`value_difference_bound`.
 
     :param epsilon: half of the largest learned distance ||phi(i) - phi(j)|| inside a cell.
     :param encoder_error: E_phi, the largest difference between the learned distance and the model's metric.
@@ -114,6 +115,7 @@ def mean_distance(mean_reward_gap: float, c_r: float, c_t: float) -> float:
     An equality, for every p, if states are drawn independently from a stationary distribution of the policy, and the chain of
     the policy moves from each of these states to a single next state. A deterministic environment is not enough: a
     stochastic policy makes the chain stochastic. For p = 1 and any chain it bounds mu_bd from above, for p > 1 not even that.
+    For :func:`~sb3_robust_bisim.theory.mico_distance` it is an equality on every chain.
 
     :param mean_reward_gap: mu_rd, the mean of |r^pi_i - r^pi_j|.
     """
@@ -127,8 +129,8 @@ def mean_variance_bound(mdp: FiniteMDP, c_r: float, c_t: float) -> tuple[float, 
 
     The bound of the variance holds for every metric that ``lemma:diam`` covers and every joint distribution of the two
     states. The bound of the mean holds for on-policy metrics with p = 1 and independent, identically distributed states
-    (any distribution). It fails for the policy-independent metric, for p > 1 and for dependent states, whose mean may
-    reach :func:`diameter_bound`, twice as much.
+    (any distribution), and for MICo's distance. It can fail for the policy-independent metric and for any p > 1. The mean over
+    dependent states may reach :func:`diameter_bound`, twice as much.
 
     :return: (bound of the mean, bound of the variance).
     """
@@ -139,7 +141,8 @@ def mean_variance_bound(mdp: FiniteMDP, c_r: float, c_t: float) -> tuple[float, 
 def policy_variance_bound(mean_reward_gap: float, reward_gap_variance: float, c_r: float, c_t: float) -> float:
     """``prop:prop4``: an upper bound of (sigma_bd^pi)^2, under the conditions of :func:`mean_distance` for equality.
 
-    A deterministic environment alone is not enough here either: with a stochastic policy the bound can fail.
+    A deterministic environment alone is not enough here either: with a stochastic policy the bound can fail, with p = 1 and
+    with p = 2.
 
     :param mean_reward_gap: mu_rd.
     :param reward_gap_variance: sigma_rd^2.

@@ -131,7 +131,7 @@ class NoiseObservation(gym.ObservationWrapper[np.ndarray, np.ndarray, np.ndarray
         self.noise_multiplier = noise_multiplier
         self.noise_std = noise_std
         self.noise_mean = noise_mean
-        self.noise_shape = unbounded.shape
+        self._noise_shape = unbounded.shape
         self._dtype = space.dtype
         self._state: np.ndarray | None = None
         self._rng = np.random.default_rng()
@@ -169,7 +169,7 @@ class NoiseObservation(gym.ObservationWrapper[np.ndarray, np.ndarray, np.ndarray
         """
         if self._state is None:
             raise ResetNeeded("look() shows the present state: call reset() first")
-        noise = self._rng.normal(self.noise_mean, self.noise_std, self.noise_shape)
+        noise = self._rng.normal(self.noise_mean, self.noise_std, self._noise_shape)
         numbers = np.concatenate([self._state, noise])
         if self.projection is not None:
             numbers = self.projection @ numbers

@@ -215,8 +215,10 @@ def test_the_denoising_factor_is_that_of_the_literature() -> None:
     assert found == pytest.approx(slow_denoising_factor(anchors, positives), abs=1e-12)
     # a state at 3 and one at 0, seen at 1 and 0: own distances 2 and 0, others 3 and 1
     assert denoising_factor(th.tensor([[3.0], [0.0]]), th.tensor([[[1.0], [0.0]]])) == pytest.approx((2 - 1) / (2 + 1))
-    # many equal embeddings of a large norm are one point, and not nearly one
-    assert denoising_factor(th.full((50, 5), 1000.1), th.full((3, 50, 5), 1000.1)) == 0.0
+    # embeddings far from the origin that do not change with the noise have a distance of 0, and not nearly 0
+    still = th.as_tensor(100 + rng.normal(size=(50, 50)), dtype=th.float32)
+    assert denoising_factor(still, still[None].repeat(3, 1, 1)) == 1.0
+    assert denoising_factor(th.ones(50, 5), th.ones(3, 50, 5)) == 0.0  # one point
 
 
 @pytest.mark.parametrize("random_projection", [False, True])

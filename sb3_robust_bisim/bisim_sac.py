@@ -180,13 +180,30 @@ class BisimSAC(SAC):
             if self.use_sde:
                 self.actor.reset_noise()
 
+            update_actor = self._n_updates % self.policy_delay == 0
+            if update_actor:
+                # Action by the current actor for the sampled state
+                actions_pi, log_prob = self.actor.action_log_prob(replay_data.observations)
+                log_prob = log_prob.reshape(-1, 1)
+
+            ent_coef_loss = None
             if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
                 # Important: detach the variable from the graph
                 # so we don't change it with other losses
                 # see https://github.com/rail-berkeley/softlearning/issues/60
                 ent_coef = th.exp(self.log_ent_coef.detach())
+                if update_actor:
+                    assert isinstance(self.target_entropy, float)
+                    ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
             else:
                 ent_coef = self.ent_coef_tensor
+
+            # Optimize entropy coefficient, also called
+            # entropy temperature or alpha in the paper
+            if ent_coef_loss is not None and self.ent_coef_optimizer is not None:
+                self.ent_coef_optimizer.zero_grad()
+                ent_coef_loss.backward()
+                self.ent_coef_optimizer.step()
 
             with th.no_grad():
                 # Select action according to policy
@@ -215,11 +232,7 @@ class BisimSAC(SAC):
             inverse_dynamics_optimizer.step()
             logged = {"train/critic_loss": critic_loss, "train/ent_coef": ent_coef, **logged}
 
-            if self._n_updates % self.policy_delay == 0:
-                # Action by the current actor for the sampled state
-                actions_pi, log_prob = self.actor.action_log_prob(replay_data.observations)
-                log_prob = log_prob.reshape(-1, 1)
-
+            if update_actor:
                 # Compute actor loss
                 # Alternative: actor_loss = th.mean(log_prob - qf1_pi)
                 # Min over all critic networks
@@ -232,16 +245,8 @@ class BisimSAC(SAC):
                 self.actor.optimizer.zero_grad()
                 actor_loss.backward(inputs=actor_parameters)
                 self.actor.optimizer.step()
-
-                if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
-                    assert isinstance(self.target_entropy, float)
-                    ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
-                    logged["train/ent_coef_loss"] = ent_coef_loss
-                    # Optimize entropy coefficient, also called
-                    # entropy temperature or alpha in the paper
-                    self.ent_coef_optimizer.zero_grad()
-                    ent_coef_loss.backward()
-                    self.ent_coef_optimizer.step()
+            if ent_coef_loss is not None:
+                logged["train/ent_coef_loss"] = ent_coef_loss
 
             # Update target networks. SAC tests the loop index, which is always 0 at `gradient_steps=1`
             if self._n_updates % self.target_update_interval == 0:

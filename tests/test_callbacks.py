@@ -1,5 +1,6 @@
 """What the diagnostics write, read back from the event files; and that they leave the run alone."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sb3_robust_bisim import BisimSAC
 from sb3_robust_bisim.callbacks import DenoisingFactorCallback, EmbeddingCallback, ValueBoundCallback, diagnostic
+from sb3_robust_bisim.callbacks.denoising import denoising_factor
 from sb3_robust_bisim.cli import zoo
 from sb3_robust_bisim.envs import NoiseObservation
 from sb3_robust_bisim.runs.checkpoint import Checkpoint, load_checkpoint
@@ -60,7 +62,14 @@ class GreyEnv(Picture):
     observation_space = gym.spaces.Box(0, 255, (8, 8, 1), np.uint8)
 
 
+def doubled() -> gym.Env:
+    noisy = NoiseObservation(Wave(), 1)
+    space = gym.spaces.Box(-2, 2, noisy.observation_space.shape, np.float32)
+    return gym.wrappers.TransformObservation(noisy, lambda obs: 2 * obs, space)
+
+
 gym.register("test/Picture-v0", Picture)  # type: ignore[arg-type]
+gym.register("test/Doubled-v0", doubled)  # type: ignore[arg-type]
 
 
 class Wave(gym.Env):
@@ -172,22 +181,99 @@ def test_of_three_grey_frames_the_newest_becomes_a_grey_sprite() -> None:
     assert callback._sprites(stack).unique().tolist() == pytest.approx([200 / 255])
 
 
+def slow_denoising_factor(anchors: np.ndarray, positives: np.ndarray) -> float:
+    """The definition, pair by pair: (N, n) anchors, (K, N, n) positives."""
+    own, other = [], []
+    for i, anchor in enumerate(anchors):
+        for j in range(len(anchors)):
+            for k in range(len(positives)):
+                distance = math.sqrt(sum((a - p) ** 2 for a, p in zip(anchor, positives[k, j], strict=True)))
+                (own if i == j else other).append(distance)
+    d_pos, d_neg = sum(own) / len(own), sum(other) / len(other)
+    return (d_neg - d_pos) / (d_neg + d_pos)
+
+
+class Watching(th.nn.Module):
+    """A small linear encoder that keeps the batches of more than one observation, each of them once."""
+
+    def __init__(self, n_inputs: int) -> None:
+        super().__init__()
+        self.weights = th.arange(50.0 * n_inputs).reshape(50, n_inputs).sin()
+        self.batches: list[np.ndarray] = []
+
+    def forward(self, obs: th.Tensor) -> th.Tensor:
+        if len(obs) > 1 and not any(np.array_equal(obs, batch) for batch in self.batches):
+            self.batches.append(obs.numpy())
+        return obs @ self.weights.T
+
+
+def test_the_denoising_factor_is_that_of_the_literature() -> None:
+    rng = np.random.default_rng(0)
+    states = rng.normal(size=(7, 3))
+    anchors, positives = states + 0.5 * rng.normal(size=(7, 3)), states + 0.5 * rng.normal(size=(4, 7, 3))
+    found = denoising_factor(th.as_tensor(anchors), th.as_tensor(positives))
+    assert found == pytest.approx(slow_denoising_factor(anchors, positives), abs=1e-12)
+    # a state at 3 and one at 0, seen at 1 and 0: own distances 2 and 0, others 3 and 1
+    assert denoising_factor(th.tensor([[3.0], [0.0]]), th.tensor([[[1.0], [0.0]]])) == pytest.approx((2 - 1) / (2 + 1))
+    # embeddings far from the origin that do not change with the noise have a distance of 0, and not nearly 0
+    still = th.as_tensor(100 + rng.normal(size=(50, 50)), dtype=th.float32)
+    assert denoising_factor(still, still[None].repeat(3, 1, 1)) == 1.0
+    assert denoising_factor(th.ones(50, 5), th.ones(3, 50, 5)) == 0.0  # one point
+
+
+@pytest.mark.parametrize("random_projection", [False, True])
+def test_the_callback_measures_anchors_and_positives_of_the_same_states_that_are_noisy_alike(
+    random_projection: bool, tmp_path: Path
+) -> None:
+    env = gym.make(NOISY, noise_multiplier=1, random_projection=random_projection)
+    model = learn(None, None, steps=1, env=env, norm_constraint=False)
+    encoder = Watching(8)
+    model.critic.features_extractor.extractor.net = encoder
+    model.tensorboard_log = str(tmp_path)
+    callback = DenoisingFactorCallback(n_states=20, n_positives=5, eval_env_kwargs=dict(noise_mean=100.0))
+    model.learn(1, callback)
+    assert [len(batch) for batch in encoder.batches] == [20] * 12
+    weights = encoder.weights.numpy()
+    for key, batches in (("", encoder.batches[:6]), ("_heldout", encoder.batches[6:])):
+        seen = np.stack(batches).astype(np.float64)
+        found = scalars(tmp_path, f"bisim/denoising_factor{key}")
+        assert found == pytest.approx(slow_denoising_factor(seen[0] @ weights.T, seen[1:] @ weights.T), abs=1e-4)
+        if random_projection:
+            seen = np.linalg.solve(env.get_wrapper_attr("projection"), seen[..., None])[..., 0]
+        state, noise = seen[..., :4], seen[..., 4:]
+        np.testing.assert_allclose(state, state[:1].repeat(6, axis=0), atol=1e-4)
+        assert np.unique(state[0].round(3), axis=0).shape == (20, 4)
+        assert abs(noise.mean() - (100 if key else 0)) < 0.2
+        # neither is the noise of any look that of another
+        assert np.unique(noise.round(4)).size > 0.9 * noise.size
+        assert noise.std() == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("n_stack", [1, 3])
 @pytest.mark.parametrize(("where", "expected"), [(slice(0, 2), 1.0), (slice(-2, None), 0.0)])
-def test_the_denoising_factor_tells_states_from_noise(where: slice, expected: float, tmp_path: Path) -> None:
-    model = learn(None, None, steps=1)
+def test_the_denoising_factor_tells_states_from_noise(where: slice, expected: float, n_stack: int, tmp_path: Path) -> None:
+    env = VecFrameStack(make_vec_env(NOISY, env_kwargs=dict(noise_multiplier=2)), n_stack)
+    model = learn(None, None, steps=1, env=env)
     model.critic.features_extractor.extractor.net = FlatEncoder(where)
     model.tensorboard_log = str(tmp_path)
-    model.learn(1, DenoisingFactorCallback(n_states=300))
-    assert scalars(tmp_path, "bisim/denoising_factor") == pytest.approx(expected, abs=0.15)
+    model.learn(1, DenoisingFactorCallback())
+    assert scalars(tmp_path, "bisim/denoising_factor") == pytest.approx(expected, abs=0.02)
 
 
 def test_the_denoising_factor_compares_stacked_frames_with_their_clean_ones(tmp_path: Path) -> None:
     for noise in (0, 128):
         env = VecFrameStack(make_vec_env("test/Picture-v0", env_kwargs=dict(noise=noise)), 3)
         folder = tmp_path / str(noise)
-        learn(folder, DenoisingFactorCallback(40, 30, env_kwargs=dict(clean_obs=True)), 40, env, policy="CnnPolicy")
-    assert scalars(tmp_path / "0", "bisim/denoising_factor") == 1.0  # without noise both looks are one
+        callback = DenoisingFactorCallback(40, 30, env_kwargs=dict(clean_obs=True), eval_env_kwargs=dict(noise=0))
+        learn(folder, callback, 40, env, policy="CnnPolicy")
+        assert scalars(folder, "bisim/denoising_factor_heldout") == pytest.approx(1.0)
+    assert scalars(tmp_path / "0", "bisim/denoising_factor") == pytest.approx(1.0)  # without noise both looks are one
     assert scalars(tmp_path / "128", "bisim/denoising_factor") < 0.9
+
+
+def test_no_held_out_number_is_recorded_unless_asked_for(tmp_path: Path) -> None:
+    learn(tmp_path, DenoisingFactorCallback(30, 10))
+    assert "bisim/denoising_factor_heldout" not in events(tmp_path).Tags()["scalars"]
 
 
 @pytest.mark.parametrize(("time_out", "rest"), [(False, 0.0), (True, 2.0)])
@@ -214,7 +300,8 @@ def test_exact_distances_keep_the_bound_and_a_collapsed_embedding_breaks_it(
 
 
 def test_a_watched_run_is_bit_for_bit_the_run_without(tmp_path: Path) -> None:
-    callbacks = [EmbeddingCallback(20, 10), DenoisingFactorCallback(20, 10), ValueBoundCallback(20, 10)]
+    denoising = DenoisingFactorCallback(20, 10, eval_env_kwargs=dict(noise_mean=1.0))
+    callbacks = [EmbeddingCallback(20, 10), denoising, ValueBoundCallback(20, 10)]
     watched, alone = (learn(tmp_path, callback) for callback in (callbacks, None))
     for name, value in watched.policy.state_dict().items():
         assert th.equal(value, alone.policy.state_dict()[name]), name
@@ -222,13 +309,14 @@ def test_a_watched_run_is_bit_for_bit_the_run_without(tmp_path: Path) -> None:
 
 def test_a_run_that_goes_on_is_looked_at_at_the_same_steps(tmp_path: Path) -> None:
     checkpoint = tmp_path / "checkpoint.pkl"
-    callback = DenoisingFactorCallback(every=30, n_states=10)
+    callback = DenoisingFactorCallback(every=30, n_states=10, eval_env_kwargs=dict(noise_mean=1.0))
     learn(tmp_path, [callback, Checkpoint(checkpoint, 40, context=callback)], steps=50)
     model, callback = load_checkpoint(checkpoint)
     assert model.num_timesteps == 40
     model.learn(60, callback, reset_num_timesteps=False)
-    looks = events(tmp_path).Scalars("bisim/denoising_factor")
-    assert [event.step for event in looks] == [30, 50, 60, 90, 100]  # 50 was the end of the part that is lost
+    for key in ("denoising_factor", "denoising_factor_heldout"):
+        looks = events(tmp_path).Scalars(f"bisim/{key}")
+        assert [event.step for event in looks] == [30, 50, 60, 90, 100]  # 50 was the end of the part that is lost
 
 
 def test_a_zoo_yaml_can_name_them(tmp_path: Path) -> None:
@@ -257,11 +345,13 @@ def test_a_zoo_yaml_can_name_them(tmp_path: Path) -> None:
             gym.make(NOISY),
             r"env_kwargs=\{'noise_multiplier': 1\}",
         ),
+        (DenoisingFactorCallback(), gym.make(NOISY, random_projection=True), "noise_multiplier > 0"),
         (
-            DenoisingFactorCallback(),
-            VecFrameStack(make_vec_env(NOISY, env_kwargs=dict(noise_multiplier=1)), 2),
-            r"shape \(16,\), where NoiseObservation gives \(8,\)",
+            DenoisingFactorCallback(eval_env_kwargs=dict(noise_mean=math.nan)),
+            gym.make(NOISY, noise_multiplier=1),
+            "noise_mean must be a finite number",
         ),
+        (DenoisingFactorCallback(), gym.make("test/Doubled-v0"), "outermost wrapper that changes observations"),
         (ValueBoundCallback(), DummyVecEnv([lambda: NoiseObservation(Wave(), 1)]), "pass env_id"),
         (ValueBoundCallback(env_id="Pendulum-v1"), None, "Pendulum-v1"),
     ],
@@ -310,3 +400,9 @@ def test_another_algorithm_is_refused() -> None:
 def test_arguments_outside_their_range_are_refused(name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=f"{name}={value}"):
         EmbeddingCallback(**{name: value})
+
+
+@pytest.mark.parametrize("value", [0, 1.5])
+def test_a_number_of_positives_that_is_none_is_refused(value: Any) -> None:
+    with pytest.raises(ValueError, match=f"n_positives={value}: DenoisingFactorCallback needs an integer >= 1"):
+        DenoisingFactorCallback(n_positives=value)

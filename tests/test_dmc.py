@@ -165,6 +165,19 @@ def test_the_state_is_one_vector_to_which_noise_is_appended() -> None:
     assert 4 < distracted[:, 24:].std() < 6
 
 
+def test_state_and_noise_can_be_mixed_by_a_random_projection() -> None:
+    kwargs: dict[str, Any] = dict(noise_multiplier=1, noise_mean=2.0)
+    plain = gym.make("robust_bisim/walker-walk-v0", **kwargs)
+    mixed = gym.make("robust_bisim/walker-walk-v0", random_projection=True, **kwargs)
+    matrix = mixed.get_wrapper_attr("projection")
+    assert mixed.observation_space == gym.spaces.Box(-np.inf, np.inf, (48,), np.float32)
+    first, second = play(plain, seed=1), play(mixed, seed=1)
+    np.testing.assert_allclose(second["observations"], first["observations"] @ matrix.T, rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(second["rewards"], first["rewards"])
+    with pytest.raises(ValueError, match="projection_seed must be an integer >= 0"):
+        gym.make("robust_bisim/walker-walk-v0", projection_seed=-1)
+
+
 def test_environments_without_a_seed_differ() -> None:
     envs = [gym.make("robust_bisim/reacher-easy-v0") for _ in range(2)]
     assert not np.array_equal(envs[0].reset()[0], envs[1].reset()[0])

@@ -1,5 +1,5 @@
 """
-Environments of the paper. Importing this package registers their ids with Gymnasium; none of its modules needs torch.
+Environments of the paper. Importing this package registers their ids with Gymnasium.
 
 A worker process that has not imported it knows the ids by their long form, as any Gymnasium id:
 ``sb3_robust_bisim.envs:robust_bisim/SparseCartPole-v0``.

@@ -199,6 +199,8 @@ class StateTask(SuiteTask):
     """
     A task of the suite with its state as the observation, flattened to one float32 vector.
 
+    Its ids take the arguments of :class:`~sb3_robust_bisim.envs.NoiseObservation` as well.
+
     :param domain: domain of the suite, such as "cheetah"
     :param task: task of the domain, such as "run"
     :param action_repeat: control steps per action, whose rewards are added up; an integer >= 1
@@ -240,7 +242,7 @@ class StateTask(SuiteTask):
         return np.asarray(flatten(self._state_space, state), dtype=np.float32)
 
 
-# Takes ``noise_multiplier`` and ``noise_std`` too
+# Takes the arguments of NoiseObservation too
 state_task = NoisyTask(StateTask)
 
 

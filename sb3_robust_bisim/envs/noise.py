@@ -1,29 +1,64 @@
-"""Distraction of the paper's Gym tasks: numbers of pure noise appended to every observation."""
+"""Distraction of the paper's Gym tasks: numbers of pure noise in every observation, appended or mixed with the state."""
 
 import math
 from typing import Any, SupportsFloat, SupportsIndex
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
 
 # Marks the noise as a child stream of the reset seed, with a number that no ``SeedSequence.spawn`` counting up from 0 reaches
-# (the letters "NOIS").
+# (the letters "NOIS"); likewise the projection ("PROJ") as a child stream of its own seed.
 _SPAWN_KEY = (0x4E4F4953,)
+_PROJECTION_SPAWN_KEY = (0x50524F4A,)
+# Beyond it, float32 observations would hold less than two digits of the direction that the matrix shrinks most
+_LARGEST_CONDITION = 1e5
 
 
-def check_noise(noise_multiplier: int, noise_std: float) -> None:
+def check_noise(
+    noise_multiplier: int, noise_std: float, noise_mean: float, random_projection: bool, projection_seed: int
+) -> None:
     """
-    Check the two arguments that every noisy task takes.
+    Check the arguments that every noisy task takes.
 
-    :param noise_multiplier: see :class:`NoiseObservation`
-    :param noise_std: see :class:`NoiseObservation`
+    :param noise_multiplier: see :class:`NoiseObservation`, likewise the others
+    :param noise_std: standard deviation of the noise
+    :param noise_mean: mean of the noise
+    :param random_projection: whether state and noise are mixed
+    :param projection_seed: what the mixing matrix is drawn from
     :raises ValueError: when one of them has the wrong type or lies outside its range
     """
-    if isinstance(noise_multiplier, bool) or not isinstance(noise_multiplier, SupportsIndex) or noise_multiplier < 0:
+    if not _is_natural(noise_multiplier):
         raise ValueError(f"noise_multiplier must be an integer >= 0 (0: no noise), got {noise_multiplier!r}")
     if not isinstance(noise_std, SupportsFloat) or not 0 <= noise_std < math.inf:
         raise ValueError(f"noise_std must be a finite number >= 0, got {noise_std!r}")
+    if not isinstance(noise_mean, SupportsFloat) or not math.isfinite(noise_mean):
+        raise ValueError(f"noise_mean must be a finite number (0: noise around zero), got {noise_mean!r}")
+    if not isinstance(random_projection, bool):
+        raise ValueError(f"random_projection must be True or False, got {random_projection!r}")
+    if not _is_natural(projection_seed):
+        raise ValueError(
+            f"projection_seed must be an integer >= 0, the same in training and evaluation, got {projection_seed!r}"
+        )
+
+
+def _is_natural(value: Any) -> bool:
+    return not isinstance(value, bool) and isinstance(value, SupportsIndex) and value.__index__() >= 0
+
+
+def _draw_projection(size: int, seed: int) -> np.ndarray:
+    """
+    :param size: rows and columns
+    :param seed: integer >= 0
+    :return: (size, size) matrix of full rank, float64, with N(0, 1) entries
+    """
+    # A RandomState and no Generator, because NumPy promises that its numbers stay the same in later versions
+    rng = np.random.RandomState(np.random.MT19937(np.random.SeedSequence(seed, spawn_key=_PROJECTION_SPAWN_KEY)))
+    while True:
+        matrix = rng.standard_normal((size, size))
+        if np.linalg.cond(matrix) <= _LARGEST_CONDITION:
+            return matrix
 
 
 class NoiseObservation(gym.ObservationWrapper[np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):
@@ -31,43 +66,79 @@ class NoiseObservation(gym.ObservationWrapper[np.ndarray, np.ndarray, np.ndarray
     Append ``noise_multiplier * dim(S)`` fresh numbers from an isotropic Gaussian to every observation, the one of ``reset``
     included (paper: "Sparse Noisy Cartpole" and the appendix on the Gym tasks; ``noise_multiplier`` is its N_m).
 
+    ``random_projection`` mixes state and noise, so that no coordinate of the observation is free of noise: the observation is
+    y = A [x; eps] with the state x, the noise eps and a square matrix A of full rank. The entries of A are N(0, 1) and nothing
+    is rescaled, as in the literature: each number of y is a weighted sum of all n = (1 + noise_multiplier) * dim(S) numbers,
+    and its variance over draws of A is the sum of their squares. Observations therefore grow with sqrt(n), and SB3's
+    ``VecNormalize(norm_reward=False)`` is the place to rescale them.
+
+    A depends on ``projection_seed`` and n alone. It is therefore the same in training and evaluation, in worker processes and
+    in a later process with a reloaded agent, and ``reset(seed=...)`` never changes it. A pickled or copied environment
+    carries it along. It is the attribute ``projection``, None without a projection.
+
     The noise has a random generator of its own. ``reset(seed=s)`` seeds it with a child stream of ``s`` and the environment is
-    never asked for a random number, so the states behind the observations are the same for every ``noise_multiplier``.
-    The generator can be saved with :meth:`get_rng_state`; pickling or copying the wrapped environment takes it along too.
+    never asked for a random number, so the states behind the observations are the same with every setting. A pickled or
+    copied environment carries the generator along.
 
     Example::
 
         >>> import gymnasium as gym
         >>> from sb3_robust_bisim.envs import NoiseObservation
-        >>> NoiseObservation(gym.make("Pendulum-v1"), noise_multiplier=2).observation_space.shape
+        >>> NoiseObservation(gym.make("Pendulum-v1"), noise_multiplier=2, random_projection=True).observation_space.shape
         (9,)
 
     :param env: environment whose observations are vectors of real numbers: a Box of shape (dim(S),) with a float dtype
     :param noise_multiplier: N_m, noise numbers per state number; an integer >= 0
     :param noise_std: standard deviation of the noise, in the unit of the observations; finite and >= 0 (paper: 1)
+    :param noise_mean: mean of the noise, in the unit of the observations; finite. An evaluation with another mean than the
+        training tests generalisation to noise out of distribution
+    :param random_projection: observe A [x; eps] in place of [x; eps]; the observation space loses its bounds
+    :param projection_seed: what A is drawn from, an integer >= 0; without meaning when ``random_projection`` is False
     :raises ValueError: for an argument outside its range, or an observation space that is not a flat Box of floats
     """
 
-    def __init__(self, env: gym.Env[np.ndarray, np.ndarray], noise_multiplier: int, noise_std: float = 1.0) -> None:
-        check_noise(noise_multiplier, noise_std)
+    def __init__(
+        self,
+        env: gym.Env[np.ndarray, np.ndarray],
+        noise_multiplier: int,
+        noise_std: float = 1.0,
+        noise_mean: float = 0.0,
+        random_projection: bool = False,
+        projection_seed: int = 0,
+    ) -> None:
+        check_noise(noise_multiplier, noise_std, noise_mean, random_projection, projection_seed)
         space = env.observation_space
         if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1 or not np.issubdtype(space.dtype, np.floating):
             raise ValueError(
-                f"env must have a Box observation space of shape (n,) and a float dtype to append noise to, got {space}; "
+                f"env must have a Box observation space of shape (n,) and a float dtype to add noise to, got {space}; "
                 "flatten it first with gymnasium.wrappers.FlattenObservation"
             )
-        RecordConstructorArgs.__init__(self, noise_multiplier=noise_multiplier, noise_std=noise_std)
+        RecordConstructorArgs.__init__(
+            self,
+            noise_multiplier=noise_multiplier,
+            noise_std=noise_std,
+            noise_mean=noise_mean,
+            random_projection=random_projection,
+            projection_seed=projection_seed,
+        )
         super().__init__(env)
         unbounded = np.full(noise_multiplier * space.shape[0], np.inf, dtype=space.dtype)
         low, high = np.concatenate([space.low, -unbounded]), np.concatenate([space.high, unbounded])
+        self.projection = _draw_projection(len(low), projection_seed) if random_projection else None
+        if random_projection:
+            low, high = np.full_like(low, -np.inf), np.full_like(high, np.inf)
         self.observation_space = gym.spaces.Box(low, high, dtype=space.dtype.type)
+        self.noise_multiplier = noise_multiplier
         self.noise_std = noise_std
-        self.noise_shape = unbounded.shape
+        self.noise_mean = noise_mean
+        self._noise_shape = unbounded.shape
+        self._dtype = space.dtype
+        self._state: np.ndarray | None = None
         self._rng = np.random.default_rng()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """
-        Reset the environment; a seed restarts the noise as well, None lets it run on.
+        Reset the environment; a seed restarts the noise as well, None lets it run on. The projection stays.
 
         :param seed: seed of the environment and, through an independent stream, of the noise
         :param options: passed to the environment
@@ -80,35 +151,34 @@ class NoiseObservation(gym.ObservationWrapper[np.ndarray, np.ndarray, np.ndarray
 
     def observation(self, observation: np.ndarray) -> np.ndarray:
         """
-        Append fresh noise.
+        Add fresh noise to what the environment observed.
 
         :param observation: of shape (dim(S),)
-        :return: array of shape ((1 + noise_multiplier) * dim(S),): the observation unchanged, then the noise
+        :return: array of shape ((1 + noise_multiplier) * dim(S),): the observation unchanged, then the noise; or, with a
+            projection, A times that
         """
-        noise = self._rng.normal(0.0, self.noise_std, self.noise_shape)
-        return np.concatenate([observation, noise.astype(observation.dtype)])
+        self._state = np.array(observation)
+        return self.look()
 
-    def get_rng_state(self) -> dict[str, Any]:
+    def look(self) -> np.ndarray:
         """
-        Read where the noise stream stands.
+        Observe the present state once more, with fresh noise. The state stays as it is; the noise of later steps moves on.
 
-        :return: state for :meth:`set_rng_state`: plain numbers and strings, fit for JSON
+        :return: array of shape ((1 + noise_multiplier) * dim(S),)
+        :raises ResetNeeded: before the first ``reset``
         """
-        return dict(self._rng.bit_generator.state)
-
-    def set_rng_state(self, state: dict[str, Any]) -> None:
-        """
-        Let the noise go on from a saved place.
-
-        :param state: what :meth:`get_rng_state` returned
-        :raises ValueError: when the state belongs to another kind of generator
-        """
-        self._rng.bit_generator.state = state
+        if self._state is None:
+            raise ResetNeeded("look() shows the present state: call reset() first")
+        noise = self._rng.normal(self.noise_mean, self.noise_std, self._noise_shape)
+        numbers = np.concatenate([self._state, noise])
+        if self.projection is not None:
+            numbers = self.projection @ numbers
+        return numbers.astype(self._dtype)
 
 
 class NoisyTask:
     """
-    Entry point of an environment id: builds the task and appends noise to its observations where that is asked for.
+    Entry point of an environment id: builds the task and puts noise into its observations where that is asked for.
 
     :param env_class: class of the task without noise; its ``metadata`` shows :func:`gymnasium.make` the render modes
     """
@@ -117,16 +187,29 @@ class NoisyTask:
         self.env_class = env_class
         self.metadata = env_class.metadata
 
-    def __call__(self, *, noise_multiplier: int = 0, noise_std: float = 1.0, **kwargs: Any) -> gym.Env[np.ndarray, np.ndarray]:
+    def __call__(
+        self,
+        *,
+        noise_multiplier: int = 0,
+        noise_std: float = 1.0,
+        noise_mean: float = 0.0,
+        random_projection: bool = False,
+        projection_seed: int = 0,
+        **kwargs: Any,
+    ) -> gym.Env[np.ndarray, np.ndarray]:
         """
         Build the environment.
 
-        :param noise_multiplier: see :class:`NoiseObservation`; 0 adds no wrapper
-        :param noise_std: see :class:`NoiseObservation`
+        :param noise_multiplier: see :class:`NoiseObservation`, likewise the next four; 0 appends nothing
+        :param noise_std: standard deviation of the noise
+        :param noise_mean: mean of the noise
+        :param random_projection: mix state and noise; also without noise
+        :param projection_seed: what the mixing matrix is drawn from
         :param kwargs: arguments of the task
-        :return: the task, inside a :class:`NoiseObservation` when ``noise_multiplier`` is not 0
+        :return: the task, inside a :class:`NoiseObservation` when there is noise or a projection
         :raises ValueError: for an argument outside its range
         """
-        check_noise(noise_multiplier, noise_std)
+        noise = (noise_multiplier, noise_std, noise_mean, random_projection, projection_seed)
+        check_noise(*noise)
         env = self.env_class(**kwargs)
-        return NoiseObservation(env, noise_multiplier, noise_std) if noise_multiplier else env
+        return NoiseObservation(env, *noise) if noise_multiplier or random_projection else env

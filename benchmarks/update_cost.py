@@ -1,10 +1,13 @@
 """
-What does a gradient step cost, beside SB3's SAC and beside the matrix products that it cannot do without?
+What does a gradient step cost, beside other SACs and beside the matrix products that it cannot do without?
 
-Arms: SB3's SAC (fp32, same encoder class, widths and batch), BisimSAC with everything on (metric, norm, dynamics, reward,
-bonus, inverse), BisimSAC with everything off, and the floor: the full method's matrix products and convolutions alone. Each
-with the actor every 2nd update (`paper`) and every update (`sac`), in fp32 and with bf16=True. All arms are interleaved in
-one process, one thread; peak memory is that of a process per arm. The last line printed is one JSON object.
+Arms: `full` is BisimSAC with everything on (metric, norm, dynamics, reward, bonus, inverse) and `off` the same with everything
+off. `sb3_encoder` is SB3's SAC with the same encoder class, widths and batch. `sb3` is SB3's SAC as a user runs it: no encoder
+in front of flat observations, NatureCNN in front of images. `sbx` is the SAC of sbx (JAX) as a user runs it, for flat
+observations. `floor` is the full method's matrix products and convolutions alone. BisimSAC and the floor are timed with the
+actor every 2nd update (`paper`) and every update (`sac`), in fp32 and with bf16=True. All arms are interleaved in one process,
+one thread; peak memory is that of a process per arm. sbx needs the extra `bench`; without it the arm is left out. The last line
+printed is one JSON object.
 """
 
 import argparse
@@ -15,6 +18,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -30,7 +34,7 @@ from stable_baselines3.common.vec_env import VecFrameStack
 from torch.nn import functional as F
 from tqdm import tqdm
 
-from sb3_robust_bisim import BisimSAC, IntrinsicRewardVecEnv
+from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer, IntrinsicRewardVecEnv
 from sb3_robust_bisim.encoders import MlpEncoder, PixelEncoder
 
 BATCH = {"mlp": 512, "cnn": 128}
@@ -66,8 +70,17 @@ def build(kind: str, arm: str, schedule: str, bf16: bool) -> BaseAlgorithm:
     policy_kwargs = dict(
         net_arch=[256, 256], features_extractor_class=encoder, features_extractor_kwargs=dict(features_dim=50)
     )
-    if arm == "sb3_sac":
-        model: BaseAlgorithm = SAC(policy, env, policy_kwargs=policy_kwargs, **common)
+    model: BaseAlgorithm
+    if arm == "sb3_encoder":
+        model = SAC(policy, env, policy_kwargs=policy_kwargs, **common)
+    elif arm == "sb3":
+        model = SAC(policy, env, policy_kwargs=dict(net_arch=[256, 256]), **common)
+    elif arm == "sbx":
+        from sbx import SAC as SbxSAC
+
+        model = SbxSAC(
+            policy, env, policy_kwargs=dict(net_arch=[256, 256]), batch_size=BATCH[kind], **{**common, "device": "auto"}
+        )
     else:
         extras = {**(FULL if arm == "full" else OFF), **SCHEDULE[schedule]}
         model = BisimSAC(policy, env, policy_kwargs=policy_kwargs, bf16=bf16, **extras, **common)
@@ -131,7 +144,12 @@ def peak_memory(kind: str, arm: str, schedule: str, bf16: bool) -> float:
 
 
 Arm = tuple[str, str, bool]  # name, schedule, bf16
-SB3_SAC: Arm = ("sb3_sac", "sac", False)
+
+
+def others(kind: str) -> dict[str, Arm]:
+    """The arms of other libraries: one schedule, fp32."""
+    names = ["sb3_encoder", "sb3", *(["sbx"] if kind == "mlp" and find_spec("sbx") else [])]
+    return {name: (name, "sac", False) for name in names}
 
 
 def build_arms(kind: str, per_round: int) -> dict[Arm, Callable[[], None]]:
@@ -148,7 +166,7 @@ def build_arms(kind: str, per_round: int) -> dict[Arm, Callable[[], None]]:
 
         return repeat
 
-    arms = {SB3_SAC: trainer(SB3_SAC)}
+    arms = {arm: trainer(arm) for arm in others(kind).values()}
     for schedule, bf16 in itertools.product(SCHEDULE, (False, True)):
         arms |= {(name, schedule, bf16): trainer((name, schedule, bf16)) for name in ("full", "off")}
         arms["floor", schedule, bf16] = repeated(floor(kind, schedule, bf16))
@@ -170,54 +188,59 @@ def time_arms(kind: str, rounds: int, per_round: int) -> dict[Arm, list[float]]:
 
 def update_times(kind: str, rounds: int, per_round: int) -> dict[str, dict]:
     times = time_arms(kind, rounds, per_round)
-    models = [arm for arm in times if arm[0] in ("sb3_sac", "full", "off")]
+    models = [arm for arm in times if arm[0] != "floor"]
     with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
         memory = dict(zip(models, pool.starmap(peak_memory, [(kind, *arm) for arm in models], 1), strict=True))
-    result: dict[str, dict] = {"fp32": {}, "bf16": {}}
+    result: dict[str, dict] = {"others": {}, "fp32": {}, "bf16": {}}
+
+    def entry_of(arm: Arm) -> dict[str, float | list[float]]:
+        entry: dict[str, float | list[float]] = {"ms": round(float(np.median(times[arm])), 3)}
+        entry["ms_quartiles"] = np.percentile(times[arm], [25, 75]).round(3).tolist()
+        return {**entry, "peak_mib": round(memory[arm])} if arm in memory else entry
+
+    for name, arm in others(kind).items():
+        result["others"][name] = entry_of(arm)
     for schedule, bf16 in itertools.product(SCHEDULE, (False, True)):
-        entry: dict[str, float | list[float]] = {}
-        for name in ("sb3_sac", "full", "off", "floor"):
-            arm = SB3_SAC if name == "sb3_sac" else (name, schedule, bf16)
-            entry[f"{name}_ms"] = round(float(np.median(times[arm])), 3)
-            entry[f"{name}_ms_quartiles"] = np.percentile(times[arm], [25, 75]).round(3).tolist()
-            if arm in memory:
-                entry[f"{name}_peak_mib"] = round(memory[arm])
-            # the ratio of each round, so that a slow spell of the machine strikes both sides
-            if name == "full":
-                for other, beside in (("sac", SB3_SAC), ("floor", ("floor", schedule, bf16))):
-                    ratios = np.divide(times[arm], times[beside])
-                    entry[f"{name}_over_{other}"] = round(float(np.median(ratios)), 3)
-        result["bf16" if bf16 else "fp32"][schedule] = entry
+        entries: dict[str, dict] = {name: entry_of((name, schedule, bf16)) for name in ("full", "off", "floor")}
+        # the ratio of each round, so that a slow spell of the machine strikes both sides
+        beside = {**others(kind), "floor": ("floor", schedule, bf16)}
+        ratios = {name: np.divide(times["full", schedule, bf16], times[arm]) for name, arm in beside.items()}
+        entries["full_over"] = {name: round(float(np.median(ratio)), 3) for name, ratio in ratios.items()}
+        result["bf16" if bf16 else "fp32"][schedule] = entries
     return result
 
 
-def bonus_cost(env_id: str, n_envs: int, steps: int, bf16: bool = False) -> dict[str, float]:
+def bonus_cost(env_id: str, n_envs: int, steps: int) -> dict[str, float]:
     """
-    Milliseconds of policy call plus environment step as in `learn()`, interleaved: with the bonus (`with_ms`), with it after
-    an update, so that nothing embedded before is of use (`after_update_ms`), and as SB3's SAC acts, with nothing bound.
+    Milliseconds of a step of `learn()` beyond its update, policy call and environment step, with the bonus and without it,
+    interleaved. `ratio` is that of whole steps, the update included.
     """
     pixels = "pixels" in env_id
     env_kwargs = dict(distractor="none", shadows=False) if pixels else dict(noise_multiplier=2)
     venv = make_vec_env(env_id, n_envs, env_kwargs=env_kwargs, seed=0)
     bonus_env = IntrinsicRewardVecEnv(VecFrameStack(venv, 3) if pixels else venv)
-    model = BisimSAC("CnnPolicy" if pixels else "MlpPolicy", bonus_env, **FULL, **CPU, buffer_size=n_envs, bf16=bf16)
+    settings = dict(learning_starts=0, batch_size=BATCH["cnn" if pixels else "mlp"], gradient_steps=2 if pixels else 1)
+    buffer: dict = dict(replay_buffer_class=FrameStackReplayBuffer) if pixels else {}
+    policy = "CnnPolicy" if pixels else "MlpPolicy"
+    model = BisimSAC(policy, bonus_env, **FULL, **CPU, **SCHEDULE["paper"], **settings, **buffer, buffer_size=1000)
     model.learn(n_envs)
     model.policy.set_training_mode(False)  # as collect_rollouts does, once before its steps
-    times: dict[str, list[float]] = {"without_ms": [], "with_ms": [], "after_update_ms": []}
-    for round_number, name in itertools.product(range(steps + 1), times):
-        bonus_env.bind(None if name == "without_ms" else model._intrinsic_reward)
-        sample_action = SAC._sample_action if name == "without_ms" else BisimSAC._sample_action
-        for _ in range(2):  # the first one finds what another arm has left
-            model._n_updates += name == "after_update_ms"
+    times: dict[str, list[float]] = {"without_ms": [], "with_ms": [], "update_ms": []}
+    for round_number in range(steps + 1):
+        for name in times:
+            bonus_env.bind(model._intrinsic_reward if name == "with_ms" else None)
             started = time.perf_counter()
-            actions, _ = sample_action(model, 0, None, n_envs)
-            model._last_obs, *_ = model.env.step(actions)  # type: ignore[union-attr]
-            seconds = time.perf_counter() - started
-        if round_number > 0:
-            times[name].append(1000 * seconds)
-    medians = {name: float(np.median(values)) for name, values in times.items()}
-    ratios = {name: float(np.median(np.divide(times[f"{name}_ms"], times["without_ms"]))) for name in ("with", "after_update")}
-    return {"n_envs": n_envs, **medians, "ratio": ratios["with"], "ratio_after_update": ratios["after_update"]}
+            if name == "update_ms":
+                model.train(settings["gradient_steps"], settings["batch_size"])
+            else:
+                actions, _ = model._sample_action(0, None, n_envs)
+                model._last_obs, *_ = model.env.step(actions)  # type: ignore[union-attr]
+            if round_number > 0:
+                times[name].append(1000 * (time.perf_counter() - started))
+        model.policy.set_training_mode(False)
+    whole = np.add(times["with_ms"], times["update_ms"]) / np.add(times["without_ms"], times["update_ms"])
+    medians = {name: round(float(np.median(values)), 3) for name, values in times.items()}
+    return {"n_envs": n_envs, **medians, "ratio": round(float(np.median(whole)), 3)}
 
 
 def learn_cost(steps: int) -> dict[str, float]:
@@ -251,9 +274,9 @@ def main() -> None:
     result["mlp"] = update_times("mlp", args.rounds, per_round=4)
     if args.cnn_rounds:
         result["cnn"] = update_times("cnn", args.cnn_rounds, per_round=2)
-    result["bonus"] = {env_id: bonus_cost(env_id, 16, 300) for env_id in (CARTPOLE, "robust_bisim/cheetah-run-v0")}
-    for precision in ("fp32", "bf16"):
-        result["bonus"][f"{PIXELS} {precision}"] = bonus_cost(PIXELS, 16, 30, bf16=precision == "bf16")
+    result["bonus"] = {CARTPOLE: bonus_cost(CARTPOLE, 1, 200)}
+    if args.cnn_rounds:
+        result["bonus"][PIXELS] = bonus_cost(PIXELS, 16, 10)
     result["learn"] = learn_cost(500)
     print(json.dumps(result))
 

@@ -1,6 +1,7 @@
 """Models of the world in embedding space: dynamics P(z' | z, a), reward r(z') and inverse dynamics g_I(z, z')."""
 
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
@@ -11,6 +12,9 @@ from sb3_robust_bisim.losses import project_to_ball
 DYNAMICS = ("deterministic", "probabilistic", "ensemble")
 ENSEMBLE_SIZE = 5
 STD_MIN, STD_MAX = 1e-4, 10.0
+# In place: one pass over memory and one allocation less for each layer, and the same numbers
+RELU: Any = partial(nn.ReLU, inplace=True)
+ELU: Any = partial(nn.ELU, inplace=True)
 
 
 class Prediction(NamedTuple):
@@ -53,7 +57,9 @@ class DynamicsModel(nn.Module):
         self.radius = radius
         output_dim = 2 * features_dim if self.probabilistic else features_dim
         self.members = nn.ModuleList(
-            nn.Sequential(*create_mlp(features_dim + action_dim, output_dim, [hidden_dim], post_linear_modules=[nn.LayerNorm]))
+            nn.Sequential(
+                *create_mlp(features_dim + action_dim, output_dim, [hidden_dim], RELU, post_linear_modules=[nn.LayerNorm])
+            )
             for _ in range(ENSEMBLE_SIZE if kind == "ensemble" else 1)
         )
 
@@ -80,7 +86,7 @@ class DynamicsModel(nn.Module):
 
 def reward_model(features_dim: int, hidden_dim: int = 512) -> nn.Module:
     """r(z'): (B, n) -> (B, 1); one hidden layer, 512 wide by default, with LayerNorm and ReLU."""
-    return nn.Sequential(*create_mlp(features_dim, 1, [hidden_dim], post_linear_modules=[nn.LayerNorm]))
+    return nn.Sequential(*create_mlp(features_dim, 1, [hidden_dim], RELU, post_linear_modules=[nn.LayerNorm]))
 
 
 class InverseDynamicsModel(nn.Module):
@@ -95,7 +101,7 @@ class InverseDynamicsModel(nn.Module):
 
     def __init__(self, features_dim: int, action_dim: int) -> None:
         super().__init__()
-        self.net = nn.Sequential(*create_mlp(2 * features_dim, action_dim, [256, 128], nn.ELU))
+        self.net = nn.Sequential(*create_mlp(2 * features_dim, action_dim, [256, 128], ELU))
 
     def forward(self, z: th.Tensor, next_z: th.Tensor) -> th.Tensor:
         """(B, n), (B, n) -> (B, n_a)"""

@@ -16,6 +16,7 @@ from torch import nn
 from torch.distributions import Distribution
 
 from sb3_robust_bisim.encoders import CombinedEncoder, Encoded, Encoder, MlpEncoder, PixelEncoder
+from sb3_robust_bisim.latent_models import RELU
 from sb3_robust_bisim.representation import Batch, Objective, Representation
 
 # Bounds of the actor's log standard deviation, reached smoothly through a tanh
@@ -104,6 +105,7 @@ class BisimPolicy(SACPolicy):
         **kwargs: Any,
     ) -> None:
         features_extractor_class = features_extractor_class or self.default_encoder
+        kwargs.setdefault("activation_fn", RELU)
         self.objective = objective
         self.bf16 = bf16
         self.inverse_dynamics_optimizer_kwargs = {**INVERSE_DYNAMICS_ADAM, **(inverse_dynamics_optimizer_kwargs or {})}

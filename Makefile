@@ -8,7 +8,7 @@ OPENGL         := libegl1 libgl1 libgl1-mesa-dri libosmesa6
 HAS_OPENGL     := import sys; from ctypes.util import find_library as f; sys.exit(not (f('EGL') or f('OSMesa')))
 INSTALL_OPENGL := test "$$(id -u)" = 0 && apt-get -qq update && apt-get -qq install -y $(OPENGL) >/dev/null
 
-.PHONY: help setup train train-pixels test test-sb3 lint type docs clean
+.PHONY: help setup train train-pixels test test-sb3 lint type docs dist clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -59,5 +59,11 @@ type: setup  ## mypy: the package is fully typed
 docs: setup  ## HTML documentation in docs/_build
 	$(BIN)/python -m sphinx -q -b html docs docs/_build
 
+dist: setup  ## sdist and wheel in dist/, checked for upload
+	$(BIN)/pip install --quiet -c constraints.txt -e ".[dist]"
+	rm -rf dist *.egg-info
+	$(BIN)/python -m build --no-isolation
+	$(BIN)/twine check --strict dist/*
+
 clean:  ## remove the virtual environment and caches
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info build docs/_build
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info build dist docs/_build

@@ -34,6 +34,7 @@ from tqdm import tqdm
 
 from sb3_robust_bisim import BisimSAC
 from sb3_robust_bisim.cli.zoo_config import check_keys, variant_settings
+from sb3_robust_bisim.runs.checkpoint import differences
 
 ROOT = Path(__file__).resolve().parent
 CONFIG = ROOT.parent / "zoo_configs" / "bisim_sac.yml"
@@ -148,9 +149,8 @@ def result_of(run: Run, out: Path) -> dict[str, Any] | None:
 def check_settings(run: Run, result: dict[str, Any], path: Path) -> None:
     """A result from before a change of the configuration is not the run's, and must not be drawn beside later ones."""
     here, there = {**DEFAULTS, **run.settings}, {**DEFAULTS, **result["arguments"]}
-    if differing := sorted(key for key in {*here, *there} if here.get(key) != there.get(key)):
-        pairs = ", ".join(f"{key} is {there.get(key)} there and {here.get(key)} in {CONFIG.name}" for key in differing)
-        sys.exit(f"{path} was made with other settings: {pairs}. Move the older results of this figure away.")
+    if differing := differences(there, here, f"in {CONFIG.name}"):
+        sys.exit(f"{path} was made with other settings: {differing}. Move the older results of this figure away.")
 
 
 # --- what a worker does; it reaches other machines by value, and imports only what is installed there

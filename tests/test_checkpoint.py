@@ -81,11 +81,18 @@ def test_a_monitor_file_has_each_episode_once(tmp_path: Path) -> None:
     def episodes(folder: Path) -> list[tuple[str, ...]]:
         return [tuple(line.split(",")[:2]) for line in (folder / "0.monitor.csv").read_text().splitlines()[1:]]
 
+    path = tmp_path / "checkpoint.pkl"
     model(tmp_path / "a").learn(STEPS)
-    model(tmp_path / "b").learn(STEPS, callback=CallbackList([Checkpoint(tmp_path / "checkpoint.pkl", 50), StopAt(90)]))
-    assert len(episodes(tmp_path / "b")) < len(episodes(tmp_path / "a"))
-    continued, _ = load_checkpoint(tmp_path / "checkpoint.pkl")
-    continued.learn(STEPS - continued.num_timesteps, reset_num_timesteps=False)
+    model(tmp_path / "b").learn(STEPS, callback=CallbackList([Checkpoint(path, 50), StopAt(90)]))
+    interrupted = episodes(tmp_path / "b")
+    assert len(interrupted) < len(episodes(tmp_path / "a"))
+    continued, _ = load_checkpoint(path)
+    assert episodes(tmp_path / "b") == interrupted  # to load changes nothing
+    save_checkpoint(path, continued)  # before another episode has ended
+    for stop in (105, STEPS):
+        continued, _ = load_checkpoint(path)
+        steps = STEPS - continued.num_timesteps
+        continued.learn(steps, CallbackList([Checkpoint(path, 45), StopAt(stop)]), reset_num_timesteps=False)
     assert episodes(tmp_path / "b") == episodes(tmp_path / "a")
 
 
@@ -159,7 +166,6 @@ def test_a_checkpoint_needs_steps_in_between() -> None:
 @pytest.fixture
 def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """A run of the command line that is cut off before it saves its agent, and leaves a checkpoint at step 50."""
-    monkeypatch.setattr("sys.argv", ["sb3_robust_bisim"])
     monkeypatch.setattr(zoo.BisimExperimentManager, "save_trained_model", lambda *_: None)
     common = [
         *("train", "--env", "robust_bisim/SparseCartPole-v0", "--eval-freq", "-1", "--verbose", "0", "--n-timesteps", "60"),
@@ -206,7 +212,7 @@ def test_a_checkpoint_of_other_versions_is_refused(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr("sb3_robust_bisim.runs.checkpoint._versions", lambda: {"torch": "1.0"})
     save_checkpoint(tmp_path / "checkpoint.pkl", BisimSAC("MlpPolicy", "Pendulum-v1", **LEARNING))
     monkeypatch.undo()
-    with pytest.raises(ValueError, match=r"needs the versions that it was written with: .*torch 1\.0 there and 2"):
+    with pytest.raises(ValueError, match=r"needs the versions that it was written with: .*torch is 1\.0 there and 2"):
         load_checkpoint(tmp_path / "checkpoint.pkl")
 
 
@@ -229,7 +235,7 @@ def test_another_file_is_refused_by_name(command: list[str], tmp_path: Path) -> 
     with pytest.raises(ValueError, match=r"checkpoint\.pkl: this is no checkpoint, but some other pickle"):
         zoo.main([*command, "--seed", "3"])
     save_checkpoint(path, BisimSAC("MlpPolicy", "Pendulum-v1", **LEARNING))
-    with pytest.raises(ValueError, match=r"--checkpoint .*checkpoint\.pkl: not written by this command"):
+    with pytest.raises(ValueError, match=r"--checkpoint .*checkpoint\.pkl: saved from Python, not by this command"):
         zoo.main([*command, "--seed", "3"])
 
 

@@ -1,5 +1,6 @@
 """The command line, run as a user runs it."""
 
+import os
 import re
 import subprocess
 import sys
@@ -9,12 +10,15 @@ from typing import Any
 import numpy as np
 import optuna
 import pytest
+import rl_zoo3.enjoy
+import rl_zoo3.train
 import yaml
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER
 
 from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer
+from sb3_robust_bisim.cli.manager import sample_bisim_sac_params
 from sb3_robust_bisim.cli.report import report
-from sb3_robust_bisim.cli.zoo import BisimExperimentManager, main, sample_bisim_sac_params
+from sb3_robust_bisim.cli.zoo import SET_BY_THE_USER, main
 from sb3_robust_bisim.cli.zoo_config import check_keys, variant_settings
 
 ROOT = Path(__file__).parent.parent
@@ -29,16 +33,12 @@ SHORT = ["-n", "120", "-params", "learning_starts:50", "batch_size:16", "initial
 class Zoo:
     """The command line in this process: importing torch and the zoo anew takes longer than any of these runs."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
-        self.monkeypatch, self.capsys = monkeypatch, capsys
+    def __init__(self, capsys: pytest.CaptureFixture) -> None:
+        self.capsys = capsys
 
     def __call__(self, *arguments: str) -> str:
-        self.monkeypatch.chdir(ROOT)
-        for name, value in (("variants", []), ("tuned", {})):  # outside of tests each command is a process of its own
-            self.monkeypatch.setattr(BisimExperimentManager, name, value)
-        self.monkeypatch.setattr(sys, "argv", ["sb3_robust_bisim", *arguments])
         try:
-            main()
+            main(arguments)
         finally:
             captured = self.capsys.readouterr()
             self.output = captured.out + captured.err
@@ -46,8 +46,9 @@ class Zoo:
 
 
 @pytest.fixture
-def zoo(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> Zoo:
-    return Zoo(monkeypatch, capsys)
+def zoo(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path) -> Zoo:
+    monkeypatch.chdir(tmp_path)  # the configuration is found from any folder
+    return Zoo(capsys)
 
 
 @pytest.mark.parametrize(
@@ -200,7 +201,7 @@ def test_a_task_without_settings_is_refused_with_those_that_have_some(zoo: Zoo, 
 
 
 @pytest.mark.parametrize(
-    ("file", "message"), [("", "this is a folder"), ("a file/run.pkl", "name a file where you may write")]
+    ("file", "message"), [("", "this is a folder"), ("a file/run.pkl", "name a file in a folder with write access")]
 )
 def test_a_checkpoint_that_could_not_be_written_is_refused_at_once(zoo: Zoo, file: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "a file").touch()
@@ -270,11 +271,11 @@ def test_a_misspelt_key_in_a_config_file_is_named(zoo: Zoo, tmp_path: Path) -> N
 NO_HER = {"using_her_replay_buffer": False, "her_kwargs": {}}
 
 
-def test_optuna_samples_arguments_that_bisim_sac_takes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(BisimExperimentManager, "tuned", {"intrinsic_reward_scale": 2.0, "inverse_dynamics_coef": 1.0})
+def test_optuna_samples_arguments_that_bisim_sac_takes() -> None:
+    tuned = {"intrinsic_reward_scale": 2.0, "inverse_dynamics_coef": 1.0}
 
     def objective(trial: optuna.Trial) -> float:
-        sampled = sample_bisim_sac_params(trial, 1, 1, NO_HER)
+        sampled = sample_bisim_sac_params(trial, 1, 1, NO_HER, tuned)
         model = BisimSAC("MlpPolicy", CARTPOLE, buffer_size=100, **sampled)
         assert model.intrinsic_reward_scale == trial.params["intrinsic_reward_scale"]
         assert HYPERPARAMS_CONVERTER["bisim_sac"](trial.params) == sampled
@@ -286,51 +287,104 @@ def test_optuna_samples_arguments_that_bisim_sac_takes(monkeypatch: pytest.Monke
     assert len({trial.value for trial in study.trials}) == 3
 
 
-def test_optuna_takes_policy_kwargs_that_are_an_expression(monkeypatch: pytest.MonkeyPatch) -> None:
-    tuned = {"policy_kwargs": "dict(n_critics=1, optimizer_kwargs=dict(eps=1e-5))"}  # as in the zoo's own files
-    monkeypatch.setattr(BisimExperimentManager, "tuned", tuned)
-    sampled = sample_bisim_sac_params(optuna.create_study().ask(), 1, 1, NO_HER)
-    assert sampled["policy_kwargs"].items() >= {"n_critics": 1, "optimizer_kwargs": {"eps": 1e-5}}.items()
+def test_optuna_tunes_the_method_of_the_command_with_its_policy_kwargs(zoo: Zoo, tmp_path: Path) -> None:
+    content = yaml.safe_load(CONFIG.read_text())
+    # an expression, as in rl-zoo3's own files
+    content[CARTPOLE]["policy_kwargs"] = "dict(n_critics=1, optimizer_kwargs=dict(eps=1e-5))"
+    config = tmp_path / "expression.yml"
+    config.write_text(yaml.dump(content))
+    study = ["--study-name", "cartpole", "--storage", f"sqlite:///{tmp_path}/study.db"]
+    optimize = ["-optimize", "--n-trials", "1", "--n-evaluations", "1", "--no-optim-plots", "--eval-episodes", "1", *study]
+    common = ["train", "--env", CARTPOLE, "-conf", str(config), "-f", str(tmp_path / "logs"), "-n", "60", "--seed", "0"]
+    zoo(*common, *optimize, "--variant", "normed-ID", "-params", "learning_starts:50", "initial_gradient_steps:1")
+    trial = optuna.load_study(study_name="cartpole", storage=study[-1]).trials[0]
+    assert trial.state == optuna.trial.TrialState.COMPLETE
+    assert {"bisim_coef", "inverse_dynamics_coef"} <= trial.params.keys()
+    assert "intrinsic_reward_scale" not in trial.params  # normed-ID has no bonus
+    assert "rl_zoo3" in str(rl_zoo3.train.ExperimentManager)  # the command leaves rl-zoo3 as it was
 
 
-def test_optuna_leaves_off_what_the_tuned_method_leaves_off(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_optuna_leaves_off_what_the_tuned_method_leaves_off() -> None:
     tuned = {**SAC, "policy_kwargs": {"n_critics": 1}}
-    monkeypatch.setattr(BisimExperimentManager, "tuned", tuned)
-    sampled = sample_bisim_sac_params(optuna.create_study().ask(), 1, 1, NO_HER)
+    sampled = sample_bisim_sac_params(optuna.create_study().ask(), 1, 1, NO_HER, tuned)
     assert not sampled.keys() & {"bisim_coef", "intrinsic_reward_scale", "inverse_dynamics_coef"}
     assert sampled["policy_kwargs"].keys() == {"n_critics", "net_arch"}
-    monkeypatch.setattr(BisimExperimentManager, "tuned", {})  # BisimSAC's defaults: the metric alone
-    sampled = sample_bisim_sac_params(optuna.create_study().ask(), 1, 1, NO_HER)
+    sampled = sample_bisim_sac_params(optuna.create_study().ask(), 1, 1, NO_HER)  # BisimSAC's defaults: the metric alone
     assert "bisim_coef" in sampled
     assert not sampled.keys() & {"intrinsic_reward_scale", "inverse_dynamics_coef"}
 
 
-def test_a_trial_is_repeated_with_the_settings_that_it_was_found_with(
-    zoo: Zoo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("expression", [False, True])
+def test_a_trial_is_repeated_with_the_settings_that_it_was_found_with(zoo: Zoo, expression: bool, tmp_path: Path) -> None:
     storage = f"sqlite:///{tmp_path}/study.db"
     study = optuna.create_study(storage=storage, study_name="pendulum")
     layers = {"features_extractor_kwargs": {"n_layers": 3}}
-    monkeypatch.setattr(BisimExperimentManager, "tuned", {"bisim_coef": 0.5, "policy_kwargs": layers})
+    config = tmp_path / "config.yml"
+    content = yaml.safe_load(CONFIG.read_text())
+    if expression:  # as in rl-zoo3's own files, which evaluates it
+        content[PENDULUM]["variants"]["DBC"]["policy_kwargs"] = "dict(features_extractor_kwargs=dict(n_layers=3))"
+    config.write_text(yaml.dump(content))
     for _ in range(2):
         trial = study.ask()
-        sampled = sample_bisim_sac_params(trial, 1, 1, NO_HER)
+        sampled = sample_bisim_sac_params(trial, 1, 1, NO_HER, {"bisim_coef": 0.5, "policy_kwargs": layers})
         study.tell(trial, 0.0)
     zoo(
         *("train", "--env", PENDULUM, "--variant", "DBC", "--eval-freq", "-1", "-n", "20", "-f", str(tmp_path)),
-        *("--storage", storage, "--study-name", "pendulum", "--trial-id", "1"),
+        *("--storage", storage, "--study-name", "pendulum", "--trial-id", "1", "-conf", str(config)),
     )
-    run = tmp_path / "bisim_sac" / "robust_bisim-SparsePendulum-v0_1" / "robust_bisim-SparsePendulum-v0"
-    trained = yaml.unsafe_load((run / "config.yml").read_text())
-    assert trained["bisim_coef"] == sampled["bisim_coef"]  # not the variant's
-    assert trained["policy_kwargs"] == {**layers, "net_arch": sampled["policy_kwargs"]["net_arch"]}
+    model = BisimSAC.load(tmp_path / "bisim_sac/robust_bisim-SparsePendulum-v0_1/robust_bisim-SparsePendulum-v0.zip")
+    assert model.bisim_coef == sampled["bisim_coef"]  # not the variant's
+    assert model.policy_kwargs["features_extractor_kwargs"] == layers["features_extractor_kwargs"]
+    assert model.policy_kwargs["net_arch"] == sampled["policy_kwargs"]["net_arch"]
 
 
-def test_it_runs_as_a_module_and_help_tells_of_the_commands_and_of_our_options(zoo: Zoo) -> None:
-    command = [sys.executable, "-m", "sb3_robust_bisim", "--help"]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=True)
-    assert "train,enjoy,plot_train,plot_from_file,all_plots" in result.stderr
+@pytest.mark.parametrize(("command", "option"), [("train", "--variant"), ("enjoy", "--exp-id")])
+def test_help_shows_the_name_of_the_command_and_its_options(zoo: Zoo, command: str, option: str) -> None:
     with pytest.raises(SystemExit):
-        zoo("train", "--help")
-    assert "--variant" in zoo.output
-    assert "--eval-freq" in zoo.output
+        zoo(command, "--help")
+    ours, theirs = zoo.output.split("All options of rl-zoo3:")
+    assert f"usage: robust-bisim {command} " in ours
+    assert f"usage: robust-bisim {command} " in theirs
+    assert option in ours
+    assert "--num-threads" in ours
+    assert str(CONFIG) in ours or command == "enjoy"
+
+
+def test_it_runs_as_a_module_and_usage_names_the_commands(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "sb3_robust_bisim", "--help"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=True)
+    assert "usage: python -m sb3_robust_bisim {train,enjoy,plot_train,plot_from_file,all_plots}" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("variables", "arguments", "threads"),
+    [
+        ({}, [], "1"),
+        ({}, ["--num-threads", "3"], "3"),
+        ({}, ["--num-threads", "-1"], "-1"),
+        ({"OMP_NUM_THREADS": "2"}, [], "-1"),
+        ({"OMP_WAIT_POLICY": "passive"}, [], "-1"),
+        ({"OMP_NUM_THREADS": "2"}, ["--num-threads", "3"], "3"),
+    ],
+)
+@pytest.mark.parametrize("command", ["train", "enjoy"])
+def test_torch_has_one_thread_unless_the_user_has_chosen(
+    command: str, variables: dict[str, str], arguments: list[str], threads: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in SET_BY_THE_USER:
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    seen: list[list[str]] = []
+    monkeypatch.setattr(getattr(rl_zoo3, command), command, lambda: seen.append(list(sys.argv)))
+    main([command, *arguments])
+    assert seen[0].count("--num-threads") == 1
+    assert seen[0][seen[0].index("--num-threads") + 1] == threads
+
+
+def test_optuna_does_not_go_with_a_checkpoint(zoo: Zoo, tmp_path: Path) -> None:
+    for optimize in ("-optimize", "--optimize-hyper"):  # rl-zoo3 takes abbreviations
+        with pytest.raises(ValueError, match=r"--checkpoint with -optimize: not supported"):
+            zoo("train", "--env", CARTPOLE, optimize, "--checkpoint", "run.pkl", "-f", str(tmp_path / "logs"))
+    assert not (tmp_path / "logs").exists()

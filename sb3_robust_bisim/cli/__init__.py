@@ -1,4 +1,4 @@
-"""The command line: rl-zoo's commands with BisimSAC, what the config files hold, and the report at the end of a run."""
+"""The command line: rl-zoo3's commands with BisimSAC, checks of its config files, and the report at the end of a run."""
 
 from sb3_robust_bisim.cli.zoo import main
 

@@ -1,4 +1,4 @@
-"""The end of a run: its learning curve as a picture, and where it began and ended in words."""
+"""The report at the end of a run: the learning curve, and the first, best and last evaluation."""
 
 from pathlib import Path
 
@@ -10,14 +10,14 @@ from sb3_robust_bisim.runs.atomic import atomic_path
 
 def report(run: Path, title: str, learning_starts: int) -> None:
     """
-    Draw the learning curve of a run and print where it began and where it ended.
+    Draw the learning curve of a run and print its first, best and last evaluation.
 
-    :param run: folder with the ``evaluations.npz`` of SB3's EvalCallback; without one there is nothing to report
-    :param title: of the picture
-    :param learning_starts: steps before which nothing was learned, -1 if the agent had learned before
+    :param run: folder with the ``evaluations.npz`` of SB3's EvalCallback; without that file, a message says so
+    :param title: title of the figure
+    :param learning_starts: step of the first update; -1 if the agent was trained before the run
     """
     if not (run / "evaluations.npz").exists():
-        print("No evaluation, no learning curve: --eval-freq was larger than the number of steps, or negative.")
+        print("No learning curve without evaluations: --eval-freq is larger than the number of steps, or negative.")
         return
     with np.load(run / "evaluations.npz") as evaluations:
         steps, returns = evaluations["timesteps"], evaluations["results"]

@@ -1,17 +1,21 @@
-"""What the zoo's config files hold for BisimSAC: entries of tasks, named variants, and keys that somebody reads."""
+"""rl-zoo3's config files for BisimSAC: the entries of tasks, named variants, and checks of their keys."""
 
 import inspect
 from pathlib import Path
 from typing import Any
 
 import yaml
-from rl_zoo3 import exp_manager
 from stable_baselines3 import SAC
 
 from sb3_robust_bisim.bisim_sac import BisimSAC
 from sb3_robust_bisim.checks import closest
 
-# What an entry of a zoo YAML may hold beside the arguments of the algorithm
+PACKAGE = Path(__file__).parents[1]
+# A wheel has the configurations inside the package. In the repository they are next to it, also for an editable install.
+FOLDERS = (PACKAGE / "zoo_configs", PACKAGE.parent / "zoo_configs")
+DEFAULT_CONFIG = next((folder for folder in FOLDERS if folder.is_dir()), FOLDERS[0]) / "bisim_sac.yml"
+
+# Keys that rl-zoo3 reads from an entry; the others are arguments of the algorithm
 ZOO_KEYS = (
     *("callback", "env_kwargs", "env_wrapper", "eval_env_kwargs", "frame_stack", "monitor_kwargs", "n_envs"),
     *("n_timesteps", "noise_std", "noise_type", "normalize", "policy", "variants", "vec_env_wrapper"),
@@ -19,25 +23,30 @@ ZOO_KEYS = (
 PASSED_BY_THE_ZOO = {"kwargs", "env", "seed", "verbose", "device", "tensorboard_log", "_init_setup_model"}
 
 
-def policy_kwargs_of(settings: dict[str, Any]) -> dict[str, Any]:
-    """Those of an entry, which may be a Python expression, as in most of the zoo's own files."""
-    policy_kwargs = settings.get("policy_kwargs", {})
-    return eval(policy_kwargs, vars(exp_manager)) if isinstance(policy_kwargs, str) else policy_kwargs
+def merged_policy_kwargs(configured: dict[str, Any] | str, found: dict[str, Any]) -> dict[str, Any] | str:
+    """
+    Extend the policy_kwargs of a config file.
+
+    :param configured: a mapping, or a Python expression as in most of rl-zoo3's files
+    :param found: keys to add or to replace, with plain values
+    :return: of the same kind; rl-zoo3 evaluates an expression
+    """
+    return f"{{**({configured}), **{found!r}}}" if isinstance(configured, str) else {**configured, **found}
 
 
 def is_yaml(config: str | Path) -> bool:
-    """The zoo takes a Python module as well, which it imports."""
+    """True for YAML files; rl-zoo3 also accepts Python files and modules."""
     return Path(config).suffix in (".yml", ".yaml")
 
 
 def variant_settings(config: str | Path, env_id: str, *names: str) -> dict[str, Any]:
     """
-    The settings that named variants of a config file lay over the entry of a task, the last one on top.
+    Merge the settings of named variants, which override the entry of a task. Later names have priority.
 
-    :param config: YAML file with a mapping ``variants``, and perhaps another one inside the task's entry
+    :param config: YAML file with a mapping ``variants``; the entry of the task may have another one, with priority
     :param env_id: the task
-    :param names: variants, ("DBC",) or ("SAC", "clean", "small") for example
-    :raises ValueError: if the file knows no such variant
+    :param names: variants, for example ("DBC",) or ("SAC", "clean", "small")
+    :raises ValueError: if the file has no such variant
     """
     if not is_yaml(config):
         raise ValueError(f"-conf {config}: --variant needs a YAML file.")
@@ -53,11 +62,11 @@ def variant_settings(config: str | Path, env_id: str, *names: str) -> dict[str, 
 
 def check_keys(hyperparams: dict[str, Any], source: str) -> None:
     """
-    Refuse keys that nobody would read, before a run folder exists.
+    Raise an error for unknown keys, so a typo cannot silently disable part of the method.
 
     :param hyperparams: an entry of a config file for BisimSAC
-    :param source: file name, for the message
-    :raises ValueError: naming the key and the closest known one
+    :param source: file or option, for the message
+    :raises ValueError: with the key and the closest known one
     """
     known = {*ZOO_KEYS, *inspect.signature(BisimSAC).parameters, *inspect.signature(SAC).parameters} - PASSED_BY_THE_ZOO
     for key in hyperparams:
@@ -67,24 +76,24 @@ def check_keys(hyperparams: dict[str, Any], source: str) -> None:
 
 def check_task(env_id: str, config: str) -> None:
     """
-    Refuse a task without an entry, for the zoo does not say which there are.
+    Raise an error for a task without an entry. rl-zoo3's own error does not list the tasks that have one.
 
     :param env_id: the task
-    :param config: file of hyperparameters; only a YAML file can be looked into
-    :raises ValueError: naming the tasks that have one
+    :param config: file with hyperparameters; only YAML files are checked
+    :raises ValueError: with the tasks that have an entry
     """
     if not is_yaml(config):
         return
     tasks = [key for key in _read(config) if key != "variants"]
-    if env_id not in tasks and "default" not in tasks:  # the zoo's entry for any task
+    if env_id not in tasks and "default" not in tasks:  # rl-zoo3 uses "default" for any task
         raise ValueError(
-            f"--env {env_id}: {config} has settings for {', '.join(tasks)}. Copy the entry of a task that is like yours, in "
-            "this file or in one of your own, which -conf names."
+            f"--env {env_id}: {config} has settings for {', '.join(tasks)}. Copy the entry of a similar task to your own "
+            "file, rename it, and pass the file with -conf."
         )
 
 
 def entry_of(config: str, env_id: str) -> dict[str, Any]:
-    """The settings of a task in a YAML file; none if it has no entry of its own."""
+    """The settings of a task in a YAML file; empty if it has no entry."""
     return _read(config).get(env_id, {})
 
 

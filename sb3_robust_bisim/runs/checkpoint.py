@@ -13,6 +13,7 @@ import inspect
 import pickle
 import platform
 import random
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -96,8 +97,11 @@ def load_checkpoint(path: str | Path) -> tuple[Any, Any]:
     """
     Bring back a model, and set the global random generators to where they stood.
 
-    Only load files that you trust: unpickling runs code. Learn on with ``reset_num_timesteps=False``; a logger that was set by
-    hand must be set again.
+    Only load files that you trust: unpickling runs code. Continue with ``learn(..., reset_num_timesteps=False)``. A logger
+    that was set by hand must be set again.
+
+    Loading changes no file. Once training continues, the first finished episode removes the episodes after the checkpoint from
+    the Monitor file.
 
     :param path: what :func:`save_checkpoint` wrote
     :return: the model with its environments and its replay buffer, and the context
@@ -106,11 +110,8 @@ def load_checkpoint(path: str | Path) -> tuple[Any, Any]:
     """
     with Path(path).open("rb") as file:
         about = _read_header(file)
-        there, here = about["versions"], _versions()
-        if there != here:
-            differing = (name for name in here if there.get(name) != here[name])
-            changes = ", ".join(f"{name} {there.get(name)} there and {here[name]} here" for name in differing)
-            raise ValueError(f"{path}: a checkpoint needs the versions that it was written with: {changes}.")
+        if differing := differences(about["versions"], _versions()):
+            raise ValueError(f"{path}: a checkpoint needs the versions that it was written with: {differing}.")
         if about["gpus"] > th.cuda.device_count():
             raise ValueError(f"{path}: written with {about['gpus']} GPUs, here are {th.cuda.device_count()}; go on there.")
         model, context, (python, numpy, torch, cuda) = cloudpickle.load(file)
@@ -123,6 +124,19 @@ def load_checkpoint(path: str | Path) -> tuple[Any, Any]:
     if cuda:
         th.cuda.set_rng_state_all(cuda)
     return model, context
+
+
+def differences(there: Mapping[str, Any], here: Mapping[str, Any], place: str = "here") -> str:
+    """
+    Describe where two sets of settings differ, for a message.
+
+    :param there: settings of a saved run; a missing key counts as None
+    :param here: settings to compare with
+    :param place: what the message calls ``here``
+    :return: the keys with both values; empty if there is no difference
+    """
+    keys = sorted(key for key in {*there, *here} if there.get(key) != here.get(key))
+    return ", ".join(f"{key} is {there.get(key)} there and {here.get(key)} {place}" for key in keys)
 
 
 def _check_environments(model: BaseAlgorithm) -> None:
@@ -180,7 +194,9 @@ class _Pickler(cloudpickle.Pickler):
             return _bare_wrapper, (type(obj),), _without(obj, "class_attributes"), None, None, _fill
         if isinstance(obj, ResultsWriter):
             obj.file_handler.flush()
-            return _reopen, (obj.file_handler.name, obj.file_handler.tell(), tuple(obj.logger.fieldnames)[3:])
+            size = getattr(obj, "size", None)
+            size = obj.file_handler.tell() if size is None else size
+            return _ContinuedResults, (obj.file_handler.name, size, tuple(obj.logger.fieldnames)[3:])
         return super().reducer_override(obj)
 
 
@@ -202,10 +218,15 @@ def _bare_wrapper(cls: type) -> Any:
     return _bare(cls, {"class_attributes": dict(inspect.getmembers(cls))})
 
 
-def _reopen(name: str, size: int, extra_keys: tuple[str, ...]) -> ResultsWriter:
-    """The file of a Monitor, without the episodes that ended after the checkpoint: they will end again."""
-    path = Path(name)
-    if path.exists():
-        with path.open("r+b") as file:
-            file.truncate(size)
-    return ResultsWriter(name, extra_keys=tuple(extra_keys), override_existing=False)
+class _ContinuedResults(ResultsWriter):
+    """The file of a Monitor. Its first new episode replaces those that ended after the checkpoint: they will end again."""
+
+    def __init__(self, name: str, size: int, extra_keys: tuple[str, ...]) -> None:
+        super().__init__(name, extra_keys=extra_keys, override_existing=False)
+        self.size: int | None = size  # of the file at the checkpoint, until it is that again
+
+    def write_row(self, epinfo: dict[str, float]) -> None:
+        if self.size is not None:
+            self.file_handler.truncate(min(self.size, Path(self.file_handler.name).stat().st_size))
+            self.size = None
+        super().write_row(epinfo)

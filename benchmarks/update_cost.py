@@ -4,10 +4,11 @@ What does a gradient step cost, beside other SACs and beside the matrix products
 Arms: `full` is BisimSAC with everything on (metric, norm, dynamics, reward, bonus, inverse) and `off` the same with everything
 off. `sb3_encoder` is SB3's SAC with the same encoder class, widths and batch. `sb3` is SB3's SAC as a user runs it: no encoder
 in front of flat observations, NatureCNN in front of images. `sbx` is the SAC of sbx (JAX) as a user runs it, for flat
-observations. `floor` is the full method's matrix products and convolutions alone. BisimSAC and the floor are timed with the
-actor every 2nd update (`paper`) and every update (`sac`), in fp32 and with bf16=True. All arms are interleaved in one process,
-one thread; peak memory is that of a process per arm. sbx needs the extra `bench`; without it the arm is left out. The last line
-printed is one JSON object.
+observations. `floor` is the full method's matrix products and convolutions alone.
+
+BisimSAC and the floor are timed with the actor every 2nd update (`paper`) and every update (`sac`), in fp32 and in bf16. All
+arms are interleaved in one process, one thread; peak memory is that of a process per arm. sbx needs the extra `bench`;
+without it the arm is left out. The last line printed is one JSON object.
 """
 
 import argparse

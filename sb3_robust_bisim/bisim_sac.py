@@ -1,6 +1,6 @@
+import inspect
 import io
 import pathlib
-from collections.abc import Iterable
 from dataclasses import fields
 from typing import Any, ClassVar, TypeVar
 
@@ -14,20 +14,13 @@ from torch.nn import functional as F
 
 from sb3_robust_bisim.checks import check_arguments, check_names
 from sb3_robust_bisim.intrinsic_reward import bound, with_intrinsic_reward
-from sb3_robust_bisim.policies import (
-    BisimActor,
-    BisimCritic,
-    BisimPolicy,
-    CnnPolicy,
-    MlpPolicy,
-    MultiInputPolicy,
-    unchecked_distributions,
-)
+from sb3_robust_bisim.policies import BisimActor, BisimCritic, BisimPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_robust_bisim.representation import Objective
 from sb3_robust_bisim.runs.atomic import atomic_save
-from sb3_robust_bisim.update_log import UpdateLog
+from sb3_robust_bisim.update_log import UpdateLog, unchecked_distributions
 
 SelfBisimSAC = TypeVar("SelfBisimSAC", bound="BisimSAC")
+PathOrStream = str | pathlib.Path | io.BufferedIOBase
 
 
 class BisimSAC(SAC):
@@ -36,11 +29,10 @@ class BisimSAC(SAC):
 
     Paper: Towards Robust Bisimulation Metric Learning (Kemertas and Aumentado-Armstrong, NeurIPS 2021).
 
-    One encoder z = phi(s), owned by the critic, is trained by critic, metric, dynamics, reward and inverse-dynamics
-    loss in one backward pass, and never by the actor loss. Each batch is encoded once.
-
-    The paper's methods are settings: SAC is ``bisim_coef=0, norm_constraint=False``; DBC ``norm_constraint=False``;
-    normed DBC the default; normed-IR adds ``intrinsic_reward_scale``, normed-ID ``inverse_dynamics_coef``.
+    One encoder z = phi(s), owned by the critic, is trained by critic, metric, dynamics, reward and inverse-dynamics loss in
+    one backward pass, and never by the actor loss. The paper's methods are settings: SAC ``bisim_coef=0,
+    norm_constraint=False``; DBC ``norm_constraint=False``; normed DBC the default; normed-IR adds ``intrinsic_reward_scale``,
+    normed-ID ``inverse_dynamics_coef``.
 
     :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a subclass of ``BisimPolicy``
     :param env: the environment, or its id
@@ -57,14 +49,13 @@ class BisimSAC(SAC):
     :param model_coef: weight of dynamics and reward loss, >= 0. None: 1 where a model is needed, that is with
         ``bisim_coef`` or ``intrinsic_reward_scale`` above 0, else 0
     :param intrinsic_reward_scale: eta_r >= 0; 0 gives no bonus
-    :param intrinsic_reward_max: R_max_I >= 0, the largest bonus, in units of reward; clamped after scaling
+    :param intrinsic_reward_max: R_max_I >= 0, the largest bonus, in units of reward
     :param inverse_dynamics_coef: eta_d >= 0, weight of the inverse-dynamics loss; 0 turns it off
-    :param policy_delay: actor and entropy coefficient are updated every ``policy_delay``-th gradient step. The target
-        nets follow SAC's ``target_update_interval``
-    :param initial_gradient_steps: gradient steps to do at once when learning starts, on the random actions gathered until
-        then (1000 in the published experiments)
-    :param bf16: run the encoder under bfloat16 autocast, on CPU or GPU: faster from pixels, where the convolutions are the
-        cost. Heads, models and losses stay in fp32: a Q value of 50 in bf16 is off by up to 0.1
+    :param policy_delay: gradient steps from one update of actor and entropy coefficient to the next. The target nets follow
+        SAC's ``target_update_interval``
+    :param initial_gradient_steps: gradient steps done at once when learning starts (1000 in the published experiments)
+    :param bf16: run the encoder under bfloat16 autocast: faster from pixels on a GPU, or a CPU that has it (see
+        docs/performance.md). Heads, models and losses stay in fp32
     :param kwargs: the arguments of :class:`stable_baselines3.SAC`; ``n_steps`` must stay 1
 
     :raises ValueError: for a value outside its range, ``n_steps`` other than 1, image observations with MlpPolicy, a
@@ -139,9 +130,9 @@ class BisimSAC(SAC):
         check_arguments(self)
         if self.env is not None:
             self.env = with_intrinsic_reward(self.env, self.observation_space, self.intrinsic_reward_scale)
-        policy_kwargs = self.policy_kwargs
         # The policy learns of our own arguments here and not in __init__, so that `load(..., c_t=0.5)` reaches it, and
         # the user's dict is saved as it was given
+        policy_kwargs = self.policy_kwargs
         self.policy_kwargs = {**policy_kwargs, "objective": objective, "bf16": self.bf16}
         super()._setup_model()
         self.policy_kwargs = policy_kwargs
@@ -160,7 +151,7 @@ class BisimSAC(SAC):
         if self.ent_coef_optimizer is not None:
             optimizers += [self.ent_coef_optimizer]
 
-        # Update learning rate according to lr schedule; the inverse-dynamics model keeps its own
+        # Update learning rate according to lr schedule
         self._update_learning_rate(optimizers)
 
         representation, actor_parameters = self.policy.representation, self.policy.actor_parameters()
@@ -174,7 +165,7 @@ class BisimSAC(SAC):
             # Sample replay buffer
             replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
             # From here on observations are encoded, each one once
-            replay_data, batch = self.policy.encode(replay_data, through_next=self.inverse_dynamics_coef > 0)
+            replay_data, batch = self.policy.encode(replay_data)
 
             # We need to sample because `log_std` may have changed between two gradient steps
             if self.use_sde:
@@ -257,22 +248,15 @@ class BisimSAC(SAC):
             log.add(self._n_updates, logged)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if representation.objective.bisim_coef > 0:
+            self.logger.record("bisim/mu_ratio_target", representation.objective.ratio_target)
         if gradient_steps > 0:
             log.add(self._n_updates, representation.statistics(batch.z.detach()))
             log.record(self.logger)
-        if self.bisim_coef > 0:
-            self.logger.record("bisim/mu_ratio_target", representation.objective.ratio_target)
 
     @th.no_grad()
     def _intrinsic_reward(self, obs: Any, actions: np.ndarray, next_obs: Any) -> np.ndarray:
-        """
-        The bonus of transitions as the environment sees them (sec:intrinsic).
-
-        :param obs: unnormalised observations, n_envs rows
-        :param actions: (n_envs, n_a) in the scale of the action space
-        :param next_obs: true successors
-        :return: (n_envs,)
-        """
+        """The bonus, (n_envs,), of transitions as the environment sees them: not normalised, actions in its own scale."""
         if self._vec_normalize_env is not None:
             obs, next_obs = self._vec_normalize_env.normalize_obs(obs), self._vec_normalize_env.normalize_obs(next_obs)
         encode = self.critic.features_extractor.encode
@@ -288,19 +272,10 @@ class BisimSAC(SAC):
         super().set_env(with_intrinsic_reward(env, self.observation_space, self.intrinsic_reward_scale), force_reset)
 
     @classmethod
-    def load(
-        cls: type[SelfBisimSAC],
-        path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | None = None,
-        device: th.device | str = "auto",
-        custom_objects: dict[str, Any] | None = None,
-        print_system_info: bool = False,
-        force_reset: bool = True,
-        **kwargs: Any,
-    ) -> SelfBisimSAC:
-        """Like SB3's ``load``; ``kwargs`` replace what the model was saved with, and must be arguments that exist."""
-        check_names(cls, kwargs)
-        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+    def load(cls: type[SelfBisimSAC], path: PathOrStream, *args: Any, **kwargs: Any) -> SelfBisimSAC:
+        """Like SB3's ``load``; arguments of BisimSAC replace what the model was saved with, and must exist."""
+        check_names(cls, kwargs, inspect.signature(SAC.load).parameters)
+        return super().load(path, *args, **kwargs)
 
     def learn(
         self: SelfBisimSAC,
@@ -314,17 +289,12 @@ class BisimSAC(SAC):
         with bound(self.env, self._intrinsic_reward if self.intrinsic_reward_scale > 0 else None):
             return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
-    def save(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-    ) -> None:
+    def save(self, path: PathOrStream, *args: Any, **kwargs: Any) -> None:
         """Like SB3's ``save``; a file that existed before stays whole until the new one is."""
         with atomic_save(path, ".zip") as whole:
-            super().save(whole, exclude, include)
+            super().save(whole, *args, **kwargs)
 
-    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+    def save_replay_buffer(self, path: PathOrStream) -> None:
         """Like SB3's ``save_replay_buffer``; a file that existed before stays whole until the new one is."""
         with atomic_save(path, ".pkl") as whole:
             super().save_replay_buffer(whole)

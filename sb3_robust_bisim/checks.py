@@ -62,10 +62,16 @@ def _require(condition: Any, model: Any, name: str, remedy: str) -> None:
         raise ValueError(f"{name}={getattr(model, name)!r}: it must be {remedy}.")
 
 
-def check_names(algorithm: type, kwargs: dict[str, Any]) -> None:
-    """Refuse an argument that no class from ``algorithm`` to SAC has: a misspelt key must not train half a method."""
+def check_names(algorithm: type, kwargs: dict[str, Any], also: Iterable[str] = ()) -> None:
+    """
+    Refuse an argument that no class from ``algorithm`` to SAC has: a typo must not silently disable a part of the method.
+
+    :param algorithm: BisimSAC or a subclass
+    :param kwargs: the arguments
+    :param also: names that are known besides
+    """
     lineage = algorithm.__mro__[: algorithm.__mro__.index(SAC) + 1]
-    known = [name for cls in lineage for name in inspect.signature(cls).parameters]
+    known = [*also, *(name for cls in lineage for name in inspect.signature(cls).parameters)]
     for name in kwargs:
         if name not in known:
             raise TypeError(f"BisimSAC has no argument {name!r} (value {kwargs[name]!r}){closest(name, known)}")

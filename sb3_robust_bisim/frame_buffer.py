@@ -1,10 +1,7 @@
 """A replay buffer that stores each frame of a frame-stacked image once and samples what SB3's buffer would sample."""
 
 import copyreg
-import pickle
 import warnings
-import zlib
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, SupportsIndex
 
@@ -16,14 +13,14 @@ from stable_baselines3.common.preprocessing import is_image_space_channels_first
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
 
+from sb3_robust_bisim.runs.packing import pack, unpack
+
 try:
     import psutil
 except ImportError:  # an extra of SB3
     psutil = None
 
 BLANK = 0  # slot of the all-zero frame, with which VecFrameStack fills a stack after a reset
-BLOCK_BYTES = 2**26  # frames are saved in blocks of this size: above 32 MiB malloc gives freed memory back to the system
-PROBE_FRAMES = 64  # frames of a block that are compressed to see whether the whole block is worth it
 ROWS = ("actions", "rewards", "dones", "timeouts", "_slots")  # arrays with one row per step of the environments
 
 
@@ -264,11 +261,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         for name in ROWS:
             state[name] = state[name][: self.size()]
         state["_references"] = self._references[: self._n_used]
-        n_block = max(BLOCK_BYTES // self._frames[0].nbytes, 1)
-        starts = range(0, self._n_used, n_block)
-        blocks = (self._frames[start : min(start + n_block, self._n_used)] for start in starts)
-        with ThreadPoolExecutor() as pool:
-            state["_frames"] = list(pool.map(partial(_pack, in_place=int(protocol) >= 5), blocks))
+        state["_frames"] = pack(self._frames[: self._n_used], in_place=int(protocol) >= 5)
         return copyreg.__newobj__, (type(self),), state  # type: ignore[attr-defined]
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -280,9 +273,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         for name, filled in rows.items():
             getattr(self, name)[: len(filled)] = filled
         self._references[: self._n_used] = references
-        start = 0
-        for block in blocks:
-            start += _unpack(block, self._frames[start:])
+        unpack(blocks, self._frames)
 
 
 def frames_per_observation(venv: VecEnv) -> int:
@@ -309,24 +300,3 @@ def _check_space(observation_space: spaces.Space, n_stack: int) -> bool:
             'number of frames that the environment stacks, replay_buffer_kwargs={"n_stack": ...}.'
         )
     return channels_first
-
-
-def _pack(block: np.ndarray, in_place: bool) -> bytes | bytearray | pickle.PickleBuffer:
-    """
-    Compress frames to ``bytes`` where zlib at least halves them: rendered scenes become 8 times smaller, video only 1.3 times.
-    Return the others as they are, without a copy if ``in_place``.
-    """
-    probe = block[:PROBE_FRAMES]
-    if 2 * len(zlib.compress(probe.data)) <= probe.nbytes:
-        return zlib.compress(block.data)
-    return pickle.PickleBuffer(block.data) if in_place else bytearray(block.data)
-
-
-def _unpack(block: bytes | bytearray, frames: np.ndarray) -> int:
-    """Write what ``_pack`` returned (a ``PickleBuffer`` comes back as ``bytearray``) to ``frames`` and return its length."""
-    raw = zlib.decompress(block) if isinstance(block, bytes) else block
-    n_frames = len(raw) // frames[0].nbytes
-    frames[:n_frames] = np.frombuffer(raw, dtype=np.uint8).reshape(n_frames, *frames.shape[1:])
-    if isinstance(block, bytearray):
-        block.clear()  # the unpickler holds on to every block until it has read the last: twice the memory otherwise
-    return n_frames

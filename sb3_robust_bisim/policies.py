@@ -1,7 +1,5 @@
 """SAC's policies with one encoder: the critic owns and trains it, the actor reads its detached output."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from typing import Any, ClassVar
 
@@ -13,7 +11,6 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, ReplayBufferSamples, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
-from torch.distributions import Distribution
 
 from sb3_robust_bisim.encoders import CombinedEncoder, Encoded, Encoder, MlpEncoder, PixelEncoder
 from sb3_robust_bisim.latent_models import RELU
@@ -65,19 +62,17 @@ class BisimCritic(ContinuousCritic):
 
 class BisimPolicy(SACPolicy):
     """
-    Actor, critic, target critic (each critic with its encoder), dynamics, reward and inverse-dynamics model.
+    Actor, critic, target critic (each critic with its encoder) and the models of the representation.
 
-    The encoder, the critic, the dynamics and the reward model share ONE optimizer, ``critic.optimizer``, since one
-    backward pass serves them all; the inverse-dynamics model has a slower one.
+    Encoder, critic, dynamics and reward model share ONE optimizer, ``critic.optimizer``, since one backward pass serves them
+    all. The inverse-dynamics model has a slower one.
 
     :param objective: what shapes the embedding beside the critic. Set by BisimSAC
     :param bf16: run the encoder under bfloat16 autocast. Set by BisimSAC
     :param share_features_extractor: True: the actor reads the critic's encoder and never trains it. False: it has one
         of its own, trained by the actor loss as in SB3's SAC; the metric then shapes the critic's alone
-    :param inverse_dynamics_optimizer_kwargs: Adam's arguments for the inverse-dynamics model. Its learning rate is
-        its own and follows no schedule
-    :param ortho_init: orthogonal initialisation of all weights, biases 0. False where ``features_extractor_class`` brings
-        weights that it has learned before
+    :param inverse_dynamics_optimizer_kwargs: Adam's arguments for the inverse-dynamics model, which follows no schedule
+    :param ortho_init: orthogonal initialisation of all weights, biases 0. False keeps weights that an encoder brings along
 
     All other parameters are those of :class:`stable_baselines3.sac.policies.SACPolicy`.
     """
@@ -104,29 +99,21 @@ class BisimPolicy(SACPolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
-        features_extractor_class = features_extractor_class or self.default_encoder
+        encoder_class = features_extractor_class or self.default_encoder
         kwargs.setdefault("activation_fn", RELU)
         self.objective = objective
         self.bf16 = bf16
         self.inverse_dynamics_optimizer_kwargs = {**INVERSE_DYNAMICS_ADAM, **(inverse_dynamics_optimizer_kwargs or {})}
         self.ortho_init = ortho_init
-        optimizer_kwargs = dict(optimizer_kwargs or {})
         if optimizer_class in (th.optim.Adam, th.optim.AdamW):
-            optimizer_kwargs = _fused(optimizer_kwargs)
-        if not kwargs.get("normalize_images", True) and issubclass(features_extractor_class, (PixelEncoder, CombinedEncoder)):
+            optimizer_kwargs = _fused(optimizer_kwargs or {})
+        if not kwargs.get("normalize_images", True) and issubclass(encoder_class, (PixelEncoder, CombinedEncoder)):
             # SB3 tells only its own extractors that images are floats already
             features_extractor_kwargs = {"normalized_image": True, **(features_extractor_kwargs or {})}
-        super().__init__(
-            observation_space,
-            action_space,
-            lr_schedule,
-            features_extractor_class=features_extractor_class,
-            features_extractor_kwargs=features_extractor_kwargs,
-            share_features_extractor=share_features_extractor,
-            optimizer_class=optimizer_class,
-            optimizer_kwargs=optimizer_kwargs,
-            **kwargs,
-        )
+        kwargs |= dict(features_extractor_class=encoder_class, features_extractor_kwargs=features_extractor_kwargs)
+        kwargs |= dict(optimizer_class=optimizer_class, optimizer_kwargs=optimizer_kwargs)
+        kwargs["share_features_extractor"] = share_features_extractor
+        super().__init__(observation_space, action_space, lr_schedule, **kwargs)
 
     def _build(self, lr_schedule: Schedule) -> None:
         self.critic = self.make_critic()
@@ -149,18 +136,17 @@ class BisimPolicy(SACPolicy):
             inverse_dynamics.parameters(), **_fused(self.inverse_dynamics_optimizer_kwargs)
         )
 
-    def encode(self, replay_data: ReplayBufferSamples, through_next: bool = True) -> tuple[ReplayBufferSamples, Batch]:
+    def encode(self, replay_data: ReplayBufferSamples) -> tuple[ReplayBufferSamples, Batch]:
         """
         Encode a batch, each observation once.
 
         :param replay_data: a batch of transitions
-        :param through_next: whether a loss sends gradient through the embeddings of the successors
         :return: the batch for actor and critics, its observations encoded; and the same for the representation
         """
         encoder, target_encoder = self.critic.features_extractor, self.critic_target.features_extractor
         obs, next_obs = (Encoded(encoder.preprocess(o)) for o in (replay_data.observations, replay_data.next_observations))
         z = obs[encoder]
-        with th.set_grad_enabled(through_next):
+        with th.set_grad_enabled(self.objective.inverse_dynamics_coef > 0):  # no other loss goes through s'
             next_z = next_obs[encoder]
         with th.no_grad():
             target_next_z = next_obs[target_encoder]
@@ -190,14 +176,8 @@ class BisimPolicy(SACPolicy):
         self.representation.train(mode)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {
-            **super()._get_constructor_parameters(),
-            "objective": self.objective,
-            "bf16": self.bf16,
-            "share_features_extractor": self.share_features_extractor,
-            "inverse_dynamics_optimizer_kwargs": self.inverse_dynamics_optimizer_kwargs,
-            "ortho_init": self.ortho_init,
-        }
+        own = ("objective", "bf16", "share_features_extractor", "inverse_dynamics_optimizer_kwargs", "ortho_init")
+        return {**super()._get_constructor_parameters(), **{name: getattr(self, name) for name in own}}
 
 
 MlpPolicy = BisimPolicy
@@ -213,21 +193,6 @@ class MultiInputPolicy(BisimPolicy):
     """:class:`BisimPolicy` for Dict observations: the encoder is :class:`CombinedEncoder` by default."""
 
     default_encoder = CombinedEncoder
-
-
-@contextmanager
-def unchecked_distributions() -> Iterator[None]:
-    """
-    Build distributions without validating their parameters: each check would wait for the device.
-
-    What it would find is found at the end of ``train()``, where the losses are checked.
-    """
-    checked = Distribution._validate_args
-    Distribution.set_default_validate_args(False)
-    try:
-        yield
-    finally:
-        Distribution.set_default_validate_args(checked)
 
 
 def _fused(adam_kwargs: dict[str, Any]) -> dict[str, Any]:

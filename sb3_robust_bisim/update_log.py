@@ -1,8 +1,12 @@
-"""What is logged of the updates of one call of ``train``."""
+"""Updates that never wait for the device: what is logged stays there until the end, and distributions are not checked."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.logger import Logger
+from torch.distributions import Distribution
 
 
 class UpdateLog:
@@ -46,3 +50,18 @@ class UpdateLog:
             logger.record(name, mean)
         if means.get("bisim/mu_rd", 0.0) > 0:  # all rewards equal: no ratio
             logger.record("bisim/mu_ratio", means["bisim/mu_bd"] / means["bisim/mu_rd"])
+
+
+@contextmanager
+def unchecked_distributions() -> Iterator[None]:
+    """
+    Build distributions without validating their parameters: each check would wait for the device.
+
+    What it would find is found at the end of ``train()``, where the losses are checked.
+    """
+    checked = Distribution._validate_args
+    Distribution.set_default_validate_args(False)
+    try:
+        yield
+    finally:
+        Distribution.set_default_validate_args(checked)

@@ -21,8 +21,8 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize, VecTransposeImage
 
-from sb3_robust_bisim import frame_buffer
 from sb3_robust_bisim.frame_buffer import FrameStackReplayBuffer
+from sb3_robust_bisim.runs import packing
 
 ACTION_SPACE = spaces.Box(-1, 1, (2,), dtype=np.float64)
 HEIGHT, WIDTH = 13, 14
@@ -213,7 +213,7 @@ def test_only_the_filled_part_is_saved_and_allocated() -> None:
 
 
 def test_frames_survive_saving_in_several_blocks_compressed_or_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_buffer, "BLOCK_BYTES", 5 * HEIGHT * WIDTH)
+    monkeypatch.setattr(packing, "BLOCK_BYTES", 5 * HEIGHT * WIDTH)
     source = Transitions(0, n_envs=1, n_stack=3, n_channels=1, padding="zeros", p_end=0.1)
     buffer = FrameStackReplayBuffer(60, image_space(3), ACTION_SPACE)
     filled(buffer, source, 25)

@@ -13,7 +13,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_robust_bisim import BisimSAC
-from sb3_robust_bisim.policies import unchecked_distributions
+from sb3_robust_bisim.update_log import unchecked_distributions
 
 ENV = "robust_bisim/SparseCartPole-v0"
 EVERYTHING: dict[str, Any] = dict(

@@ -67,11 +67,11 @@ class CameraPose(RandomSequence):
         if not self._dynamic:
             return
         velocity = self._velocity + self._noise * self._rng.standard_normal(4)
-        velocity[:3] *= min(1.0, self._max_speed / float(np.linalg.norm(velocity[:3])))
-        velocity[3] = np.clip(velocity[3], -self._max_roll_speed, self._max_roll_speed)
+        velocity[:3] *= min(1.0, self._max_speed / math.hypot(*velocity[:3]))
+        velocity[3] *= min(1.0, self._max_roll_speed / abs(velocity[3]))
         pose = self.pose + velocity
-        self._velocity = np.where((pose < self.low) | (pose > self.high), -velocity, velocity)
-        self.pose = np.clip(pose, self.low, self.high)
+        self.pose = np.minimum(np.maximum(pose, self.low), self.high)
+        self._velocity = np.where(self.pose == pose, velocity, -velocity)
 
     def move(self, position: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """

@@ -336,6 +336,11 @@ def test_a_new_distractor_is_one_class_and_one_entry(monkeypatch: pytest.MonkeyP
         make_distractor("snow", SIZE, "clips")
 
 
+def test_every_distractor_is_told_of() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "distractors.md").read_text(encoding="utf-8")
+    assert [name for name in DISTRACTORS if f'| `"{name}"` |' not in page] == []
+
+
 def test_video_moves_on_by_one_frame_and_begins_again_at_its_end(clips: Path) -> None:
     video = ClipDistractor(SIZE, clips)
     video.seed(0)

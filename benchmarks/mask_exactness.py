@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 from render_speed import describe_run
 
+from sb3_robust_bisim.envs.distractors import ColorDistractor
 from sb3_robust_bisim.envs.dmc import SUITE
 from sb3_robust_bisim.envs.pixels import PixelTask
 
@@ -37,11 +38,10 @@ def replaced(env: PixelTask, size: int) -> np.ndarray:
     :param size: height and width of the frames in pixels
     :return: mask of shape (size, size) of the pixels that change with the background
     """
-    assert env.distractor is not None
+    assert isinstance(env.distraction.background, ColorDistractor)
     frames = []
     for shade in (0, 255):
-        picture = np.full((size, size, 3), shade, dtype=np.uint8)
-        env.distractor.set_state({**env.distractor.get_state(), "_frame": picture})
+        env.distraction.background.paint(np.full(3, shade, dtype=np.uint8))
         frames.append(np.asarray(env.render()))
     return np.any(frames[0] != frames[1], axis=-1)
 

@@ -11,7 +11,15 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from sb3_robust_bisim.envs.distractors import DISTRACTORS, BallsDistractor, ClipDistractor, Distractor, make_distractor
+from sb3_robust_bisim.envs.distractors import (
+    DISTRACTORS,
+    BallsDistractor,
+    ClipDistractor,
+    Distractor,
+    ImageDistractor,
+    NoiseDistractor,
+    make_distractor,
+)
 from sb3_robust_bisim.envs.video import cache_folder, load_clip, split_clips
 
 SIZE = 16
@@ -288,29 +296,49 @@ def test_a_seed_reproduces_the_pictures_and_another_gives_others(distractor: Dis
     assert (runs[0] != runs[2]).any()
 
 
-def test_a_saved_state_goes_on_exactly_within_and_beyond_the_episode(distractor: Distractor) -> None:
+def play_on(distractor: Distractor) -> np.ndarray:
+    """The present picture, the rest of the episode and the next one."""
+    seen = [distractor.frame.copy(), *pictures(distractor, 5)]
+    distractor.reset()
+    return np.array([*seen, *pictures(distractor, 5)])
+
+
+def test_a_pickled_copy_goes_on_exactly_within_and_beyond_the_episode(distractor: Distractor) -> None:
     distractor.seed(0)
     distractor.reset()
     pictures(distractor, 2)
-    state = pickle.loads(pickle.dumps(distractor.get_state()))
+    copied = pickle.loads(pickle.dumps(distractor))
+    np.testing.assert_array_equal(play_on(copied), play_on(distractor))
 
-    def go_on() -> np.ndarray:
-        seen = [distractor.frame.copy(), *pictures(distractor, 5)]
-        distractor.reset()
-        return np.array([*seen, *pictures(distractor, 5)])
 
-    expected = go_on()
+def test_another_sequence_is_independent_and_leaves_the_first_alone(distractor: Distractor) -> None:
+    distractor.seed(0)
     distractor.reset()
-    distractor.set_state(state)
-    np.testing.assert_array_equal(go_on(), expected)
-    distractor.set_state(state)  # playing on has not changed it
-    np.testing.assert_array_equal(go_on(), expected)
+    pictures(distractor, 2)
+    expected = play_on(pickle.loads(pickle.dumps(distractor)))
+    others = [play_on(distractor.another()) for _ in range(2)]
+    np.testing.assert_array_equal(play_on(distractor), expected)
+    assert not np.array_equal(others[0], expected)
+    assert not np.array_equal(others[0], others[1])
+    distractor.seed(0)
+    np.testing.assert_array_equal(play_on(distractor.another()), others[0])
 
 
-def test_a_state_of_another_kind_is_refused() -> None:
-    state = BallsDistractor(SIZE).get_state()
-    with pytest.raises(ValueError, match="get_state of another ColorDistractor"):
-        make_distractor("color", SIZE).set_state(state)  # type: ignore[union-attr]
+def test_a_new_distractor_is_one_class_and_one_entry(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Snow(NoiseDistractor):
+        pass
+
+    monkeypatch.setitem(DISTRACTORS, "snow", Snow)
+    assert isinstance(make_distractor("snow", SIZE), Snow)
+    with pytest.raises(ValueError, match=r"distractor must be one of .*'snow'.*got 'fog'"):
+        make_distractor("fog", SIZE)
+    with pytest.raises(ValueError, match=r"only for the distractors \('images', 'video'\), got 'clips' for 'snow'"):
+        make_distractor("snow", SIZE, "clips")
+
+
+def test_every_distractor_is_told_of() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "distractors.md").read_text(encoding="utf-8")
+    assert [name for name in DISTRACTORS if f'| `"{name}"` |' not in page] == []
 
 
 def test_video_moves_on_by_one_frame_and_begins_again_at_its_end(clips: Path) -> None:
@@ -333,7 +361,7 @@ def test_every_episode_has_a_new_clip_and_start(clips: Path) -> None:
 
 
 def test_an_image_stays_for_its_episode(clips: Path) -> None:
-    images = ClipDistractor(SIZE, clips, moving=False)
+    images = ImageDistractor(SIZE, clips)
     images.seed(0)
     episodes = set()
     for _ in range(20):
@@ -359,14 +387,16 @@ def test_a_colour_fills_the_picture_for_an_episode() -> None:
     assert (seen == seen[0, 0, 0]).all()
 
 
-def test_noise_is_gaussian_and_fresh_at_every_step() -> None:
-    noise = make_distractor("noise", 84)
-    assert noise is not None
+def test_noise_is_as_strong_as_in_the_literature_and_fresh_at_every_step() -> None:
+    noise = NoiseDistractor(84)
     noise.seed(0)
     noise.reset()
     seen = np.array(pictures(noise, 4), dtype=float)
-    assert seen.mean() == pytest.approx(127.5, abs=1)
-    assert seen.std() == pytest.approx(62, abs=2)  # 64 before values beyond [0, 255] are clipped
+    expected = np.clip(255 * np.random.default_rng(1).standard_normal(1_000_000), 0, 255)
+    assert seen.mean() == pytest.approx(expected.mean(), abs=2)
+    assert seen.std() == pytest.approx(expected.std(), abs=2)
+    assert (seen == 0).mean() == pytest.approx(0.5, abs=0.01)
+    assert (seen == 255).mean() == pytest.approx(0.1587, abs=0.01)
     assert abs(np.corrcoef(seen[0].ravel(), seen[1].ravel())[0, 1]) < 0.03
 
 
@@ -374,25 +404,20 @@ def test_balls_stay_in_the_picture_visible_and_in_motion() -> None:
     balls = BallsDistractor(64)
     balls.seed(0)
     balls.reset()
-    start, first_picture = balls.get_state(), balls.frame
+    start, first_picture = np.linalg.norm(balls._velocities), balls.frame
     for _ in range(1000):
         balls.step()
-        state = balls.get_state()
-        centers, radii = state["_centers"], state["_radii"][:, None]
-        assert (centers >= radii).all()
-        assert (centers <= 1 - radii).all()
-    assert np.linalg.norm(state["_velocities"]) == pytest.approx(np.linalg.norm(start["_velocities"]), rel=0.3)
+        assert (balls._centers >= balls._radii[:, None]).all()
+        assert (balls._centers <= 1 - balls._radii[:, None]).all()
+    assert np.linalg.norm(balls._velocities) == pytest.approx(start, rel=0.3)
     assert 0.05 < balls.frame.any(-1).mean() < 0.6
     assert (balls.frame != first_picture).mean() > 0.1
 
 
 def test_balls_attract_each_other_with_forces_that_cancel() -> None:
     balls = BallsDistractor(64, count=2)
-    state = balls.get_state()
-    state["_centers"], state["_velocities"] = np.array([[0.4, 0.5], [0.6, 0.5]]), np.zeros((2, 2))
-    state["_radii"] = np.array([0.1, 0.2])
-    balls.set_state(state)
+    balls._centers, balls._radii = np.array([[0.4, 0.5], [0.6, 0.5]]), np.array([0.1, 0.2])
     balls.step()
-    (left, right), masses = balls.get_state()["_velocities"], state["_radii"] ** 2
+    (left, right), masses = balls._velocities, balls._radii**2
     assert left[0] > 0 > right[0]
     np.testing.assert_allclose(masses[0] * left + masses[1] * right, 0, atol=1e-12)

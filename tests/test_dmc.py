@@ -17,6 +17,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
 import sb3_robust_bisim.envs  # noqa: F401
+from sb3_robust_bisim.envs.distractors import ColorDistractor
 from sb3_robust_bisim.envs.dmc import SUITE
 from sb3_robust_bisim.envs.pixels import PixelTask
 
@@ -210,7 +211,7 @@ def test_a_frame_without_distractor_is_that_of_dm_control(task: str) -> None:
 @pytest.mark.parametrize("task", ["cartpole-swingup", "finger-spin", "reacher-easy", "cheetah-run", "fish-swim"])
 def test_the_background_is_exactly_where_no_object_is(task: str) -> None:
     env = make(task, distractor="color", render_mode="rgb_array", render_size=84)
-    assert env.distractor is not None
+    assert isinstance(env.distraction.background, ColorDistractor)
     model = env.physics.model
     env.reset(seed=0)
     env.action_space.seed(0)
@@ -218,8 +219,7 @@ def test_the_background_is_exactly_where_no_object_is(task: str) -> None:
         env.step(env.action_space.sample())
         frames = []
         for shade in (0, 255):
-            picture = np.full((84, 84, 3), shade, dtype=np.uint8)
-            env.distractor.set_state({**env.distractor.get_state(), "_frame": picture})
+            env.distraction.background.paint(np.full(3, shade, dtype=np.uint8))
             frames.append(np.asarray(env.render()))
         replaced = (frames[0] != frames[1]).any(-1)
         assert (frames[0][replaced] == 0).all()
@@ -278,25 +278,13 @@ def test_a_seed_reproduces_what_is_seen_and_the_clean_frame_tells_the_task(distr
 
 
 def test_training_and_evaluation_show_different_clips() -> None:
-    paths = {split: make("pendulum-swingup", distractor="video", split=split).distractor.paths for split in ("train", "eval")}  # type: ignore[union-attr]
+    backgrounds = {
+        split: make("pendulum-swingup", distractor="video", split=split).distraction.background for split in ("train", "eval")
+    }
+    paths = {split: background.paths for split, background in backgrounds.items()}  # type: ignore[union-attr]
     assert len(paths["train"]) == 2
     assert len(paths["eval"]) == 1
     assert not set(paths["train"]) & set(paths["eval"])
-
-
-def test_the_distractor_of_a_running_environment_can_be_resumed(clips: list[Path]) -> None:
-    env = make("pendulum-swingup", distractor="video", distractor_files=clips)
-    assert env.distractor is not None
-    env.reset(seed=0)
-    state = env.distractor.get_state()
-
-    def corners() -> np.ndarray:
-        seen = [env.step(env.action_space.low)[0][:9, :9] for _ in range(3)]
-        return np.array([*seen, env.reset()[0][:9, :9]])
-
-    expected = corners()
-    env.distractor.set_state(state)
-    np.testing.assert_array_equal(corners(), expected)
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,16 @@
 """Cameras that stay: frames of a dm_control physics, as dm_control draws them or keyed for a background."""
 
+import math
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import mujoco
 import numpy as np
 from dm_control.mujoco import wrapper
 
-from sb3_robust_bisim.envs.distractors import Distractor
 from sb3_robust_bisim.envs.opengl import rendering_contexts
+from sb3_robust_bisim.envs.scene import CameraPose, Distraction
 
 # What is drawn beyond the objects themselves. Off for the key; the fog would tint the objects.
 _EFFECTS = (
@@ -34,6 +37,31 @@ def camera_index(physics: Any, camera_id: int | str) -> int:
     if isinstance(camera_id, int) and not isinstance(camera_id, bool) and 0 <= camera_id < len(names):
         return camera_id
     raise ValueError(f"camera_id must be a number in [0, {len(names) - 1}] or one of {names}, got {camera_id!r}")
+
+
+def make_camera_pose(physics: Any, camera_id: int | str, scale: float, dynamic: bool, upper_quadrant: bool) -> CameraPose:
+    """
+    Measure, in the reference pose of the model, from where a camera looks at what.
+
+    It looks at the centre of mass of the body that it tracks, else of everything. A camera that looks ahead from a body turns
+    around a point at a distance of the model's extent.
+
+    :param physics: a dm_control physics
+    :param camera_id: number or name of a camera of the model
+    :param scale: see :class:`~sb3_robust_bisim.envs.scene.CameraPose`
+    :param dynamic: see :class:`~sb3_robust_bisim.envs.scene.CameraPose`
+    :param upper_quadrant: keep to the upper quadrant; False for the reacher
+    :return: what moves the camera
+    :raises ValueError: when the model has no such camera
+    """
+    camera, model = camera_index(physics, camera_id), physics.model.ptr
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    body = max(int(model.cam_targetbodyid[camera]), 0) or int(model.cam_bodyid[camera])
+    backward = data.cam_xmat[camera].reshape(3, 3)[:, 2]
+    radius, extent = float((data.cam_xpos[camera] - data.subtree_com[body]) @ backward), float(model.stat.extent)
+    elevation = math.asin(float(np.clip(backward[2], -1, 1))) if upper_quadrant else None
+    return CameraPose(scale, dynamic, elevation, radius if radius > 0.1 * extent else extent)
 
 
 class Camera:
@@ -73,31 +101,38 @@ class Camera:
         self._own_context = wrapper.MjrContext(physics.model, self._gl) if own_context else None
         self._context = self._own_context or contexts.mujoco
 
-    def frame(self, size: int) -> np.ndarray:
+    def frame(self, size: int, distraction: Distraction | None = None) -> np.ndarray:
         """
         Draw the present state.
 
         :param size: height and width in pixels, at most ``max_size``
+        :param distraction: what moves the camera and paints the scene, if anything shall; its background is not drawn
         :return: new contiguous uint8 array of shape (size, size, 3)
         """
-        return np.ascontiguousarray(self._draw(size)[::-1])
+        return np.ascontiguousarray(self._draw(size, distraction)[::-1])
 
     def close(self) -> None:
         """Free the context of its own; the camera must not be used afterwards."""
         if self._own_context is not None:
             self._own_context.free()
 
-    def _update_scene(self) -> None:
+    def _update_scene(self, distraction: Distraction | None) -> None:
         model, data = self._physics.model.ptr, self._physics.data.ptr
         everything = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(model, data, self._option, self._perturb, self._camera, everything, self._scene)
+        with ExitStack() as undo:
+            if distraction is not None and distraction.camera is not None:
+                undo.enter_context(_moved(data, self._camera.fixedcamid, distraction.camera))
+            if distraction is not None and distraction.colors is not None:
+                undo.enter_context(distraction.colors.on(model))
+            mujoco.mjv_updateScene(model, data, self._option, self._perturb, self._camera, everything, self._scene)
 
-    def _draw(self, size: int) -> np.ndarray:
+    def _draw(self, size: int, distraction: Distraction | None) -> np.ndarray:
         """
         :param size: height and width in pixels
+        :param distraction: see :meth:`frame`
         :return: uint8 array of shape (size, size, 3), bottom row first, that the next call overwrites
         """
-        self._update_scene()
+        self._update_scene(distraction)
         if size not in self._buffers:
             self._buffers[size] = np.empty((size, size, 3), dtype=np.uint8)
         with self._gl.make_current() as gl:
@@ -122,47 +157,66 @@ class KeyCamera(Camera):
     :param physics: a dm_control physics
     :param camera_id: number or name of a camera of the model
     :param max_size: largest height and width that will be asked for, in pixels
-    :param distractor: its present picture is scaled to the size of the frame, without smoothing
     :param own_context: see :class:`Camera`
     :raises ValueError: when the model has no such camera
     """
 
-    def __init__(
-        self, physics: Any, camera_id: int | str, max_size: int, distractor: Distractor, *, own_context: bool = False
-    ) -> None:
+    def __init__(self, physics: Any, camera_id: int | str, max_size: int, *, own_context: bool = False) -> None:
         super().__init__(physics, camera_id, max_size, effects=False, own_context=own_context)
-        self._distractor = distractor
         for effect in _EFFECTS:
             self._scene.flags[effect] = 0
         self._planes = np.flatnonzero(physics.model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE))
         self._plane_groups = physics.model.geom_group[self._planes].copy()
 
-    def frame(self, size: int) -> np.ndarray:
+    def frame(self, size: int, distraction: Distraction | None = None) -> np.ndarray:
         """
-        Draw the present state in front of the present picture of the distractor.
+        Draw the present state in front of the present picture of the background.
 
         :param size: height and width in pixels, at most ``max_size``
+        :param distraction: has a background, whose picture is scaled to the size of the frame, without smoothing
         :return: new contiguous uint8 array of shape (size, size, 3)
         """
-        objects = self._draw(size)
+        assert distraction is not None
+        assert distraction.background is not None
+        objects = self._draw(size, distraction)
         covered = (objects[..., 0] | objects[..., 1] | objects[..., 2]) != 0
-        frame = self._background(size)
+        frame = _scaled(distraction.background.frame, size)
         frame[::-1][covered] = objects[covered]
         return frame
 
-    def _background(self, size: int) -> np.ndarray:
-        """
-        :param size: height and width in pixels
-        :return: new contiguous uint8 array of shape (size, size, 3)
-        """
-        picture = self._distractor.frame
-        if len(picture) == size:
-            return picture.copy(order="C")
-        nearest = np.arange(size) * len(picture) // size
-        return picture[nearest[:, None], nearest]
-
-    def _update_scene(self) -> None:
+    def _update_scene(self, distraction: Distraction | None) -> None:
         groups = self._physics.model.geom_group
         groups[self._planes] = _HIDDEN_GROUP
-        super()._update_scene()
+        super()._update_scene(distraction)
         groups[self._planes] = self._plane_groups
+
+
+@contextmanager
+def _moved(data: Any, camera: int, pose: CameraPose) -> Iterator[None]:
+    """
+    Move a camera, wherever tracking has put it, for the length of a ``with`` block.
+
+    :param data: ``mujoco.MjData``
+    :param camera: its number
+    :param pose: where to
+    """
+    position, axes = data.cam_xpos[camera], data.cam_xmat[camera]
+    usual = position.copy(), axes.copy()
+    moved, turned = pose.move(position, axes.reshape(3, 3))
+    position[:], axes[:] = moved, turned.ravel()
+    try:
+        yield
+    finally:
+        position[:], axes[:] = usual
+
+
+def _scaled(picture: np.ndarray, size: int) -> np.ndarray:
+    """
+    :param picture: square uint8 array
+    :param size: height and width in pixels
+    :return: new contiguous uint8 array of shape (size, size, 3)
+    """
+    if len(picture) == size:
+        return picture.copy(order="C")
+    nearest = np.arange(size) * len(picture) // size
+    return picture[nearest[:, None], nearest]

@@ -1,75 +1,31 @@
 """Pictures that take the place of the background and have nothing to do with the task."""
 
-import copy
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from sb3_robust_bisim.envs.random_sequence import RandomSequence
 from sb3_robust_bisim.envs.video import SplitClipFiles, check_split, load_clip, split_clips
 
-DISTRACTORS = ("none", "color", "noise", "images", "video", "balls")
-_FROM_FILES = ("images", "video")
 
-
-class Distractor(ABC):
+class Distractor(RandomSequence):
     """
-    A sequence of background pictures from a random generator of its own: a new one per episode, moved on by one per step of
-    the agent.
+    A sequence of background pictures. A new kind is one subclass with this argument (or one of :class:`ClipDistractor`, which
+    takes files) and one entry of :data:`DISTRACTORS`.
 
     :param size: height and width of the pictures in pixels
     """
 
-    # Names of the attributes that change while it plays
-    _playing: tuple[str, ...]
-
     def __init__(self, size: int) -> None:
+        super().__init__()
         self._shape = (size, size, 3)
-        self._rng = np.random.default_rng()
-
-    def seed(self, seed: int) -> None:
-        """
-        Restart the random generator.
-
-        :param seed: integer >= 0
-        """
-        self._rng = np.random.default_rng(seed)
-
-    @abstractmethod
-    def reset(self) -> None:
-        """Choose the picture that an episode starts with."""
-
-    @abstractmethod
-    def step(self) -> None:
-        """Move on by one step of the agent."""
 
     @property
     @abstractmethod
     def frame(self) -> np.ndarray:
         """The present picture: uint8 array of shape (size, size, 3), not to be written to."""
-
-    def get_state(self) -> dict[str, Any]:
-        """
-        Read where the sequence stands.
-
-        :return: state for :meth:`set_state`; it can be pickled
-        """
-        playing = {name: copy.deepcopy(getattr(self, name)) for name in self._playing}
-        return {"rng": copy.deepcopy(self._rng.bit_generator.state), **playing}
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """
-        Go on exactly from a saved place.
-
-        :param state: what :meth:`get_state` of a distractor with the same arguments returned
-        :raises ValueError: when the state is that of another kind of distractor
-        """
-        if set(state) != {"rng", *self._playing}:
-            raise ValueError(f"state must come from get_state of another {type(self).__name__}, got one with {sorted(state)}")
-        self._rng.bit_generator.state = state["rng"]
-        for name in self._playing:
-            setattr(self, name, copy.deepcopy(state[name]))
 
 
 class ColorDistractor(Distractor):
@@ -79,14 +35,20 @@ class ColorDistractor(Distractor):
     :param size: height and width of the pictures in pixels
     """
 
-    _playing = ("_frame",)
-
     def __init__(self, size: int) -> None:
         super().__init__(size)
         self._frame = np.zeros(self._shape, dtype=np.uint8)
 
+    def paint(self, color: np.ndarray) -> None:
+        """
+        Show a colour until the next episode.
+
+        :param color: red, green and blue: uint8 array of shape (3,)
+        """
+        self._frame = np.broadcast_to(color, self._shape).copy()
+
     def reset(self) -> None:
-        self._frame = np.broadcast_to(self._rng.integers(0, 256, 3, dtype=np.uint8), self._shape).copy()
+        self.paint(self._rng.integers(0, 256, 3, dtype=np.uint8))
 
     def step(self) -> None:
         pass
@@ -96,20 +58,28 @@ class ColorDistractor(Distractor):
         return self._frame
 
 
-class NoiseDistractor(ColorDistractor):
+class NoiseDistractor(Distractor):
     """
-    Gaussian noise of mean 127.5 and standard deviation 64 in every channel of every pixel, clipped to [0, 255] and fresh at
-    every step.
+    Gaussian noise, fresh at every step: clip(255 N(0, 1), 0, 255) in every channel of every pixel, as strong as in the
+    literature. Half of the numbers are 0 and one in six is 255; their mean is 80.
 
     :param size: height and width of the pictures in pixels
     """
 
+    def __init__(self, size: int) -> None:
+        super().__init__(size)
+        self._frame = np.zeros(self._shape, dtype=np.uint8)
+
     def reset(self) -> None:
         noise = self._rng.standard_normal(self._shape, dtype=np.float32)
-        self._frame = np.clip(127.5 + 64.0 * noise, 0, 255).astype(np.uint8)
+        self._frame = np.clip(255.0 * noise, 0, 255).astype(np.uint8)
 
     def step(self) -> None:
         self.reset()
+
+    @property
+    def frame(self) -> np.ndarray:
+        return self._frame
 
 
 class ClipDistractor(Distractor):
@@ -120,13 +90,10 @@ class ClipDistractor(Distractor):
     :param files: see :func:`~sb3_robust_bisim.envs.video.split_clips`; all of them, of either split, are decoded
         at once
     :param split: "train" or "eval": which of the files to play
-    :param moving: False holds the first frame of each episode: still images, which may come from pictures as well
     :param grayscale: play without colour
     :param cache_dir: see :func:`~sb3_robust_bisim.envs.video.cache_folder`
     :raises ValueError: for an argument outside its range, or a file that is missing, empty or broken
     """
-
-    _playing = ("_clip", "_position")
 
     def __init__(
         self,
@@ -134,7 +101,6 @@ class ClipDistractor(Distractor):
         files: SplitClipFiles | None = None,
         split: str = "train",
         *,
-        moving: bool = True,
         grayscale: bool = False,
         cache_dir: str | None = None,
     ) -> None:
@@ -152,7 +118,6 @@ class ClipDistractor(Distractor):
         clips = {path: self._load(path) for path in everything}
         self.paths = paths[split]
         self._clips = [clips[path] for path in self.paths]
-        self._moving = moving
         self._clip = 0
         self._position = 0
 
@@ -168,13 +133,23 @@ class ClipDistractor(Distractor):
         self._position = int(self._rng.integers(len(self._clips[self._clip])))
 
     def step(self) -> None:
-        if self._moving:
-            self._position = (self._position + 1) % len(self._clips[self._clip])
+        self._position = (self._position + 1) % len(self._clips[self._clip])
 
     @property
     def frame(self) -> np.ndarray:
         frame = self._clips[self._clip][self._position]
         return frame if frame.ndim == 3 else np.broadcast_to(frame[..., None], self._shape)
+
+
+class ImageDistractor(ClipDistractor):
+    """
+    Still images: each episode shows a random frame of a random file, which may be a video or a picture.
+
+    The arguments are those of :class:`ClipDistractor`.
+    """
+
+    def step(self) -> None:
+        pass
 
 
 class BallsDistractor(Distractor):
@@ -187,7 +162,6 @@ class BallsDistractor(Distractor):
     :param count: number of balls
     """
 
-    _playing = ("_centers", "_velocities", "_radii", "_colors")
     _radius_range = (0.06, 0.14)  # in widths of the picture
     _start_speed = 0.02  # standard deviation of each component, widths per step
     _gravity = 4e-4  # acceleration of two balls at distance 1, per unit of mass, widths per step^2
@@ -229,24 +203,38 @@ class BallsDistractor(Distractor):
         return frame
 
 
+# What ``distractor=...`` of a task may be. Names, checks and error messages come from here.
+DISTRACTORS: dict[str, type[Distractor] | None] = {
+    "none": None,
+    "color": ColorDistractor,
+    "noise": NoiseDistractor,
+    "images": ImageDistractor,
+    "video": ClipDistractor,
+    "balls": BallsDistractor,
+}
+
+
 def check_distractor(name: str, files: SplitClipFiles | None, split: str, grayscale: bool) -> None:
     """
     Check the arguments that need no file to be opened.
 
-    :param name: one of "none", "color", "noise", "images", "video" and "balls"
-    :param files: see :class:`ClipDistractor`; only for images and video
+    :param name: a key of :data:`DISTRACTORS`
+    :param files: see :class:`ClipDistractor`; only for distractors from files
     :param split: "train" or "eval"; without meaning for distractors that take no files
-    :param grayscale: see :class:`ClipDistractor`; only for images and video
+    :param grayscale: see :class:`ClipDistractor`; only for distractors from files
     :raises ValueError: for an argument outside its range, or one that the distractor would ignore
     """
-    if name not in DISTRACTORS:
-        raise ValueError(f"distractor must be one of {DISTRACTORS}, got {name!r}")
+    if name not in tuple(DISTRACTORS):
+        raise ValueError(f"distractor must be one of {tuple(DISTRACTORS)}, got {name!r}")
     check_split(split)
-    if name not in _FROM_FILES:
-        if files is not None:
-            raise ValueError(f"distractor_files is only for the distractors {_FROM_FILES}, got {files!r} for {name!r}")
-        if grayscale:
-            raise ValueError(f"grayscale is only for the distractors {_FROM_FILES}, got {grayscale!r} for {name!r}")
+    from_files = tuple(key for key, kind in DISTRACTORS.items() if kind is not None and issubclass(kind, ClipDistractor))
+    if name in from_files:
+        return
+    for argument, value, default in (("distractor_files", files, None), ("grayscale", grayscale, False)):
+        if value != default:
+            raise ValueError(
+                f"{argument} is only for the distractors {from_files}, got {value!r} for {name!r}: leave it out, or choose one"
+            )
 
 
 def make_distractor(
@@ -261,7 +249,7 @@ def make_distractor(
     """
     Build a distractor by its name.
 
-    :param name: one of "none", "color", "noise", "images", "video" and "balls"
+    :param name: a key of :data:`DISTRACTORS`
     :param size: height and width of the pictures in pixels
     :param files: see :class:`ClipDistractor`
     :param split: "train" or "eval"; without meaning for distractors that take no files
@@ -272,7 +260,7 @@ def make_distractor(
         empty or broken
     """
     check_distractor(name, files, split, grayscale)
-    if name in _FROM_FILES:
-        return ClipDistractor(size, files, split, moving=name == "video", grayscale=grayscale, cache_dir=cache_dir)
-    simple = {"color": ColorDistractor, "noise": NoiseDistractor, "balls": BallsDistractor}
-    return simple[name](size) if name in simple else None
+    kind = DISTRACTORS[name]
+    if kind is not None and issubclass(kind, ClipDistractor):
+        return kind(size, files, split, grayscale=grayscale, cache_dir=cache_dir)
+    return None if kind is None else kind(size)

@@ -17,7 +17,7 @@ from sb3_robust_bisim.envs.opengl import import_suite
 
 if TYPE_CHECKING:
     from sb3_robust_bisim.envs.camera import Camera
-    from sb3_robust_bisim.envs.distractors import Distractor
+    from sb3_robust_bisim.envs.scene import Distraction
 
 # dm_control.suite.ALL_TASKS without importing it
 SUITE = {
@@ -73,7 +73,7 @@ class SuiteTask(gym.Env[np.ndarray, np.ndarray]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012
     action_space: gym.spaces.Box
-    distractor: "Distractor | None" = None
+    distraction: "Distraction | None" = None
 
     def __init__(
         self,
@@ -100,7 +100,7 @@ class SuiteTask(gym.Env[np.ndarray, np.ndarray]):
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": max(round(1 / (shimmy_env.dt * action_repeat)), 1)}
         self._render_size = render_size
-        self._views: list[Camera] = self._make_views()  # the last of them shows what ``render`` returns
+        self._views: list[Camera] = []  # what ``_make_views`` returns: the last of them shows what ``render`` returns
         space = self._env.action_space
         assert isinstance(space, gym.spaces.Box)
         bounded = space.high < _UNBOUNDED
@@ -133,17 +133,17 @@ class SuiteTask(gym.Env[np.ndarray, np.ndarray]):
         """
         Begin an episode.
 
-        :param seed: seed of the start state and of the distractor; None lets both run on
+        :param seed: seed of the start state and of what distracts; None lets both run on
         :param options: not used
         :return: observation and info
         """
         super().reset(seed=seed)
         state, info = self._env.reset(seed=seed)
         self._episode_over = False
-        if self.distractor is not None:
+        if self.distraction is not None:
             if seed is not None:
-                self.distractor.seed(seed)
-            self.distractor.reset()
+                self.distraction.seed(seed)
+            self.distraction.reset()
         return self._observe(state, info), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -170,17 +170,17 @@ class SuiteTask(gym.Env[np.ndarray, np.ndarray]):
             self._episode_over = terminated or truncated
             if self._episode_over:
                 break
-        if self.distractor is not None:
-            self.distractor.step()
+        if self.distraction is not None:
+            self.distraction.step()
         return self._observe(state, info), total_reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
         """
-        Draw what there is to see, the distractor included.
+        Draw what there is to see, distraction included.
 
         :return: frame of shape (render_size, render_size, 3), or None without a render mode
         """
-        return None if self.render_mode is None else self._views[-1].frame(self._render_size)
+        return None if self.render_mode is None else self._views[-1].frame(self._render_size, self.distraction)
 
     def close(self) -> None:
         """Free the OpenGL contexts and the physics."""
@@ -226,6 +226,7 @@ class StateTask(SuiteTask):
         super().__init__(domain, task, action_repeat, camera_id, render_mode, render_size)
         # A Dict, some of whose parts are single numbers of shape ()
         self._state_space = self._env.observation_space
+        self._views = self._make_views()
         box = flatten_space(self._state_space)
         assert isinstance(box, gym.spaces.Box)
         low, high = box.low.astype(np.float32), box.high.astype(np.float32)

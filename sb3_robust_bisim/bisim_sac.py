@@ -54,6 +54,7 @@ class BisimSAC(SAC):
     :param policy_delay: gradient steps from one update of actor and entropy coefficient to the next. The target nets follow
         SAC's ``target_update_interval``
     :param initial_gradient_steps: gradient steps done at once when learning starts (1000 in the published experiments)
+    :param random_shift: shift the images of each batch by up to this many pixels (DrQ), s and s' apart; 0 turns it off
     :param bf16: run the encoder under bfloat16 autocast: faster from pixels on a GPU, or a CPU that has it (see
         docs/performance.md). Heads, models and losses stay in fp32
     :param kwargs: the arguments of :class:`stable_baselines3.SAC`; ``n_steps`` must stay 1
@@ -96,6 +97,7 @@ class BisimSAC(SAC):
         inverse_dynamics_coef: float = 0.0,
         policy_delay: int = 2,
         initial_gradient_steps: int = 0,
+        random_shift: int = 0,
         bf16: bool = False,
         _init_setup_model: bool = True,
         **kwargs: Any,
@@ -117,6 +119,7 @@ class BisimSAC(SAC):
         self.inverse_dynamics_coef = inverse_dynamics_coef
         self.policy_delay = policy_delay
         self.initial_gradient_steps = initial_gradient_steps
+        self.random_shift = random_shift
         self.bf16 = bf16
 
         if _init_setup_model:
@@ -133,7 +136,8 @@ class BisimSAC(SAC):
         # The policy learns of our own arguments here and not in __init__, so that `load(..., c_t=0.5)` reaches it, and
         # the user's dict is saved as it was given
         policy_kwargs = self.policy_kwargs
-        self.policy_kwargs = {**policy_kwargs, "objective": objective, "bf16": self.bf16}
+        own = {"objective": objective, "bf16": self.bf16, "random_shift": self.random_shift}
+        self.policy_kwargs = {**policy_kwargs, **own}
         super()._setup_model()
         self.policy_kwargs = policy_kwargs
 

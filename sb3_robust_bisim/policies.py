@@ -12,6 +12,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, ReplayBufferSample
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
+from sb3_robust_bisim.augmentation import random_shift
 from sb3_robust_bisim.encoders import CombinedEncoder, Encoded, Encoder, MlpEncoder, PixelEncoder
 from sb3_robust_bisim.latent_models import RELU
 from sb3_robust_bisim.representation import Batch, Objective, Representation
@@ -68,7 +69,7 @@ class BisimPolicy(SACPolicy):
     all. The inverse-dynamics model has a slower one.
 
     :param objective: what shapes the embedding beside the critic. Set by BisimSAC
-    :param bf16: run the encoder under bfloat16 autocast. Set by BisimSAC
+    :param bf16: run the encoder under bfloat16 autocast. Set by BisimSAC, likewise ``random_shift``
     :param share_features_extractor: True: the actor reads the critic's encoder and never trains it. False: it has one
         of its own, trained by the actor loss as in SB3's SAC; the metric then shapes the critic's alone
     :param inverse_dynamics_optimizer_kwargs: Adam's arguments for the inverse-dynamics model, which follows no schedule
@@ -90,6 +91,7 @@ class BisimPolicy(SACPolicy):
         *,
         objective: Objective,
         bf16: bool = False,
+        random_shift: int = 0,
         features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         features_extractor_kwargs: dict[str, Any] | None = None,
         share_features_extractor: bool = True,
@@ -103,6 +105,7 @@ class BisimPolicy(SACPolicy):
         kwargs.setdefault("activation_fn", RELU)
         self.objective = objective
         self.bf16 = bf16
+        self.random_shift = random_shift
         self.inverse_dynamics_optimizer_kwargs = {**INVERSE_DYNAMICS_ADAM, **(inverse_dynamics_optimizer_kwargs or {})}
         self.ortho_init = ortho_init
         if optimizer_class in (th.optim.Adam, th.optim.AdamW):
@@ -138,13 +141,16 @@ class BisimPolicy(SACPolicy):
 
     def encode(self, replay_data: ReplayBufferSamples) -> tuple[ReplayBufferSamples, Batch]:
         """
-        Encode a batch, each observation once.
+        Encode a batch, each observation once; images are shifted at random before, if that is asked for.
 
         :param replay_data: a batch of transitions
         :return: the batch for actor and critics, its observations encoded; and the same for the representation
         """
         encoder, target_encoder = self.critic.features_extractor, self.critic_target.features_extractor
-        obs, next_obs = (Encoded(encoder.preprocess(o)) for o in (replay_data.observations, replay_data.next_observations))
+        observations = (replay_data.observations, replay_data.next_observations)
+        if self.random_shift:
+            observations = tuple(random_shift(images, self.random_shift) for images in observations)  # type: ignore[assignment]
+        obs, next_obs = (Encoded(encoder.preprocess(o)) for o in observations)
         z = obs[encoder]
         with th.set_grad_enabled(self.objective.inverse_dynamics_coef > 0):  # no other loss goes through s'
             next_z = next_obs[encoder]
@@ -176,7 +182,14 @@ class BisimPolicy(SACPolicy):
         self.representation.train(mode)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        own = ("objective", "bf16", "share_features_extractor", "inverse_dynamics_optimizer_kwargs", "ortho_init")
+        own = (
+            "objective",
+            "bf16",
+            "random_shift",
+            "share_features_extractor",
+            "inverse_dynamics_optimizer_kwargs",
+            "ortho_init",
+        )
         return {**super()._get_constructor_parameters(), **{name: getattr(self, name) for name in own}}
 
 

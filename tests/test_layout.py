@@ -18,6 +18,7 @@ CORE |= {"intrinsic_reward", "frame_buffer"}
 # What each module or folder may import; `runs` and `callbacks` serve any model, `cli` may know everything
 MAY_KNOW: dict[str, set[str]] = {
     "losses": set(),
+    "augmentation": set(),
     "frame_buffer": {"runs"},
     "intrinsic_reward": set(),
     "update_log": set(),
@@ -27,7 +28,7 @@ MAY_KNOW: dict[str, set[str]] = {
     "encoders": {"losses"},
     "latent_models": {"losses"},
     "representation": {"losses", "latent_models"},
-    "policies": {"encoders", "latent_models", "representation"},
+    "policies": {"augmentation", "encoders", "latent_models", "representation"},
     "checks": {"policies"},
     "bisim_sac": {"checks", "intrinsic_reward", "policies", "representation", "runs", "update_log"},
     "callbacks": {"bisim_sac", "encoders", "envs", "frame_buffer", "losses", "theory"},

@@ -42,12 +42,17 @@ class BisimSAC(SAC):
     :param reward_range: (R_min, R_max) of one agent step: action repeat sums rewards. It sets the radius of the norm
         constraint. The bonus is not counted, and the paper takes (0, 1) for all its tasks
     :param norm_constraint: hold embeddings and predictions in the L2 ball of eq:constraint, with radius
-        c_R (R_max - R_min) / (2 (1 - c_T)). Between points of it only ``distance="l2"`` is at most the metric's diameter
-    :param distance: "huber" (elementwise, the paper's experiments), "l1" or "l2" (norms of the whole embedding);
-        see :func:`sb3_robust_bisim.losses.pairwise_distance`
+        c_R (R_max - R_min) / (2 (1 - c_T)). Between points of it only ``distance="l2"`` is at most the metric's diameter.
+        "sphere": scale embeddings to length 1 (SimSR)
+    :param distance: "huber" (elementwise, the paper's experiments), "l1", "l2", "mico", "cosine" or "rap"; see
+        :mod:`sb3_robust_bisim.losses`
+    :param metric_kwargs: other settings of the metric, such as ``dict(successors="sample", pairs="all")``; see
+        :class:`sb3_robust_bisim.metrics.Metric`
     :param dynamics: "deterministic", "probabilistic" (Gaussian) or "ensemble" (5 Gaussians)
+    :param nll_beta: in [0, 1]; above 0 Gaussian dynamics learn by beta-NLL, see :func:`sb3_robust_bisim.losses.dynamics_loss`
     :param model_coef: weight of dynamics and reward loss, >= 0. None: 1 where a model is needed, that is with
         ``bisim_coef`` or ``intrinsic_reward_scale`` above 0, else 0
+    :param reward_coef: weight of the reward loss where it differs from ``model_coef``, >= 0
     :param intrinsic_reward_scale: eta_r >= 0; 0 gives no bonus
     :param intrinsic_reward_max: R_max_I >= 0, the largest bonus, in units of reward
     :param inverse_dynamics_coef: eta_d >= 0, weight of the inverse-dynamics loss; 0 turns it off
@@ -88,10 +93,13 @@ class BisimSAC(SAC):
         c_r: float = 1.0,
         c_t: float | None = None,
         reward_range: tuple[float, float] = (0.0, 1.0),
-        norm_constraint: bool = True,
+        norm_constraint: bool | str = True,
         distance: str = "huber",
+        metric_kwargs: dict[str, Any] | None = None,
         dynamics: str = "deterministic",
+        nll_beta: float = 0.0,
         model_coef: float | None = None,
+        reward_coef: float | None = None,
         intrinsic_reward_scale: float = 0.0,
         intrinsic_reward_max: float = 0.1,
         inverse_dynamics_coef: float = 0.0,
@@ -112,8 +120,11 @@ class BisimSAC(SAC):
         self.reward_range = reward_range
         self.norm_constraint = norm_constraint
         self.distance = distance
+        self.metric_kwargs = metric_kwargs
         self.dynamics = dynamics
+        self.nll_beta = nll_beta
         self.model_coef = model_coef
+        self.reward_coef = reward_coef
         self.intrinsic_reward_scale = intrinsic_reward_scale
         self.intrinsic_reward_max = intrinsic_reward_max
         self.inverse_dynamics_coef = inverse_dynamics_coef

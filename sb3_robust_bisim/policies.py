@@ -152,11 +152,13 @@ class BisimPolicy(SACPolicy):
             observations = tuple(random_shift(images, self.random_shift) for images in observations)  # type: ignore[assignment]
         obs, next_obs = (Encoded(encoder.preprocess(o)) for o in observations)
         z = obs[encoder]
-        with th.set_grad_enabled(self.objective.inverse_dynamics_coef > 0):  # no other loss goes through s'
+        metric = self.objective.metric
+        with th.set_grad_enabled(self.objective.inverse_dynamics_coef > 0 or metric.absorbing):
             next_z = next_obs[encoder]
         with th.no_grad():
             target_next_z = next_obs[target_encoder]
-        batch = Batch(z, replay_data.actions, replay_data.rewards, replay_data.dones, next_z, target_next_z)
+            target_z = obs[target_encoder] if metric.target_encoder == "both" else None
+        batch = Batch(z, replay_data.actions, replay_data.rewards, replay_data.dones, next_z, target_next_z, target_z)
         return replay_data._replace(observations=obs, next_observations=next_obs), batch  # type: ignore[arg-type]
 
     def actor_parameters(self) -> list[nn.Parameter]:
@@ -166,7 +168,8 @@ class BisimPolicy(SACPolicy):
 
     def make_features_extractor(self) -> Encoder:
         extractor = super().make_features_extractor()
-        return Encoder(extractor, self.observation_space, self.objective.radius, self.bf16, self.normalize_images)
+        shape = (self.objective.radius, self.objective.norm_constraint == "sphere")
+        return Encoder(extractor, self.observation_space, *shape, self.bf16, self.normalize_images)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> BisimActor:
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)

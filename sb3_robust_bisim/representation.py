@@ -1,16 +1,16 @@
 """What shapes the embedding beside the critic: metric, dynamics, reward and inverse dynamics, with their weights."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from torch import nn
-from torch.nn import functional as F
 
 from sb3_robust_bisim import losses
-from sb3_robust_bisim.latent_models import DYNAMICS, DynamicsModel, InverseDynamicsModel, reward_model
+from sb3_robust_bisim.latent_models import DYNAMICS, DynamicsModel, InverseDynamicsModel, Prediction, RewardModel
 from sb3_robust_bisim.losses import DISTANCES
+from sb3_robust_bisim.metrics import METRIC_LOSSES, Metric
 
 
 class Batch(NamedTuple):
@@ -23,6 +23,7 @@ class Batch(NamedTuple):
     :param dones: (B, 1), 1 where the episode ended by a true termination
     :param next_z: (B, n) embeddings of the successors; with gradient where a loss sends one through them
     :param target_next_z: (B, n) embeddings of the successors by the target encoder, without gradient
+    :param target_z: (B, n) embeddings of the observations by the target encoder; None where no metric asks for them
     """
 
     z: th.Tensor
@@ -31,6 +32,7 @@ class Batch(NamedTuple):
     dones: th.Tensor
     next_z: th.Tensor
     target_next_z: th.Tensor
+    target_z: th.Tensor | None = None
 
 
 @dataclass
@@ -45,20 +47,26 @@ class Objective:
     c_r: float
     c_t: float
     reward_range: tuple[float, float]
-    norm_constraint: bool
+    norm_constraint: bool | str
     distance: str
     dynamics: str
+    nll_beta: float
     model_coef: float | None
+    reward_coef: float | None
     intrinsic_reward_scale: float
     intrinsic_reward_max: float
     inverse_dynamics_coef: float
+    metric_kwargs: dict[str, Any] | None
 
     def __post_init__(self) -> None:
         for name in ("bisim_coef", "c_r", "intrinsic_reward_scale", "intrinsic_reward_max", "inverse_dynamics_coef"):
             self._require(_is_number(getattr(self, name), 0), name, "a finite number >= 0")
-        self._require(_is_number(self.model_weight, 0), "model_coef", "None or a finite number >= 0")
+        for name in ("model_coef", "reward_coef"):
+            self._require(
+                getattr(self, name) is None or _is_number(getattr(self, name), 0), name, "None or a finite number >= 0"
+            )
         remedy = "above 0 where bisim_coef or intrinsic_reward_scale needs the dynamics model"
-        self._require(self.model_coef != 0 or not self._needs_model, "model_coef", remedy)
+        self._require(self.model_coef != 0 or not self.needs_model, "model_coef", remedy)
         self._require(_is_number(self.c_t, 0) and self.c_t < 1, "c_t", "None (gamma) or in [0, 1), else no metric exists")
         ordered = bool(
             isinstance(self.reward_range, (tuple, list))
@@ -67,11 +75,20 @@ class Objective:
             and self.reward_range[0] < self.reward_range[1]
         )
         self._require(ordered, "reward_range", "(R_min, R_max), finite, with R_min < R_max")
-        self._require(isinstance(self.norm_constraint, (bool, np.bool_)), "norm_constraint", "True or False")
-        point = self.norm_constraint and self.c_r == 0
+        shape = isinstance(self.norm_constraint, (bool, np.bool_)) or self.norm_constraint == "sphere"
+        self._require(shape, "norm_constraint", 'True, False or "sphere"')
+        point = self.in_ball and self.c_r == 0
         self._require(not point, "c_r", "above 0, or norm_constraint=False: the ball is a point")
         self._require(self.distance in DISTANCES, "distance", f"one of {', '.join(DISTANCES)}")
         self._require(self.dynamics in DYNAMICS, "dynamics", f"one of {', '.join(DYNAMICS)}")
+        self._require(_is_number(self.nll_beta, 0) and self.nll_beta <= 1, "nll_beta", "in [0, 1]")
+        on_sphere = self.distance != "cosine" or self.norm_constraint == "sphere"
+        self._require(on_sphere, "distance", 'another one, or norm_constraint="sphere": it is meant for unit vectors')
+        known = [field.name for field in fields(Metric)][3:]
+        kwargs = self.metric_kwargs or {}
+        for name in kwargs.keys() - known:
+            raise ValueError(f"metric_kwargs with {name}={kwargs[name]!r}: it may hold {', '.join(known)}.")
+        self.metric = Metric(self.distance, self.c_r, self.c_t, **kwargs)
 
     def _require(self, condition: bool, name: str, remedy: str) -> None:
         if not condition:
@@ -80,16 +97,27 @@ class Objective:
     @property
     def model_weight(self) -> float:
         """Weight of dynamics and reward loss: ``model_coef``, or if that is None 1 where a model is needed, else 0."""
-        return float(self._needs_model) if self.model_coef is None else self.model_coef
+        return float(self.needs_model) if self.model_coef is None else self.model_coef
 
     @property
-    def _needs_model(self) -> bool:
-        return self.bisim_coef > 0 or self.intrinsic_reward_scale > 0
+    def reward_weight(self) -> float:
+        """Weight of the reward loss: ``reward_coef``, or if that is None the weight of the models."""
+        return self.model_weight if self.reward_coef is None else self.reward_coef
+
+    @property
+    def needs_model(self) -> bool:
+        from_model = (self.metric_kwargs or {}).get("successors", "model") == "model"
+        return (self.bisim_coef > 0 and from_model) or self.intrinsic_reward_scale > 0
+
+    @property
+    def in_ball(self) -> bool:
+        """Whether the ball holds the embeddings."""
+        return self.norm_constraint is True or self.norm_constraint is np.True_
 
     @property
     def radius(self) -> float | None:
-        """Radius of the ball that holds the embeddings (eq:constraint), None without ``norm_constraint``."""
-        return losses.ball_radius(self.c_r, self.c_t, self.reward_range) if self.norm_constraint else None
+        """Radius of the ball that holds the embeddings (eq:constraint), None without one."""
+        return losses.ball_radius(self.c_r, self.c_t, self.reward_range) if self.in_ball else None
 
     @property
     def ratio_target(self) -> float:
@@ -113,7 +141,7 @@ class Representation(nn.Module):
         super().__init__()
         self.objective = objective
         self.dynamics = DynamicsModel(features_dim, action_dim, objective.dynamics, objective.radius)
-        self.reward_model = reward_model(features_dim)
+        self.reward_model = RewardModel(features_dim, objective.metric.loss == "variance_corrected")
         self.inverse_dynamics = InverseDynamicsModel(features_dim, action_dim)
 
     def losses(self, batch: Batch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
@@ -124,25 +152,65 @@ class Representation(nn.Module):
         """
         objective = self.objective
         total, logged = batch.z.new_zeros(()), {}
-        if objective.bisim_coef > 0 or objective.model_weight > 0:
+        prediction = reward_variance = None
+        if objective.model_weight > 0 or objective.needs_model:
             prediction = self.dynamics(batch.z, batch.actions)
-        if objective.model_weight > 0:
-            predicted_rewards = self.reward_model(self.dynamics.sample(prediction))
-            logged["train/dynamics_loss"] = losses.dynamics_loss(prediction.mean, prediction.std, batch.next_z)
-            logged["train/reward_loss"] = F.mse_loss(predicted_rewards, batch.rewards)
-            total = total + objective.model_weight * (logged["train/dynamics_loss"] + logged["train/reward_loss"])
-        if objective.bisim_coef > 0:
-            mean, std = prediction.moments()
-            pairs = th.randperm(len(batch.z), device=batch.z.device)
-            logged["train/bisim_loss"], logged["bisim/mu_bd"], logged["bisim/mu_rd"] = losses.bisim_loss(
-                batch.z, batch.rewards, mean, std, pairs, objective.c_r, objective.c_t, objective.distance
+            logged["train/dynamics_loss"] = losses.dynamics_loss(
+                prediction.mean, prediction.std, batch.next_z, objective.nll_beta
             )
-            total = total + objective.bisim_coef * logged["train/bisim_loss"]
+            total = total + objective.model_weight * logged["train/dynamics_loss"]
+            if objective.reward_weight > 0:
+                predicted_rewards, reward_std = self.reward_model(self.dynamics.sample(prediction))
+                logged["train/reward_loss"] = losses.reward_loss(predicted_rewards, reward_std, batch.rewards)
+                total = total + objective.reward_weight * logged["train/reward_loss"]
+                reward_variance = None if reward_std is None else reward_std.detach().square()
+        if objective.bisim_coef > 0:
+            bisim_loss, means = self._metric_loss(batch, prediction, reward_variance)
+            total = total + objective.bisim_coef * bisim_loss
+            logged |= {"train/bisim_loss": bisim_loss, **means}
         if objective.inverse_dynamics_coef > 0:
             predicted_actions = self.inverse_dynamics(batch.z, batch.next_z)
             logged["train/inverse_dynamics_loss"] = losses.inverse_dynamics_loss(predicted_actions, batch.actions)
             total = total + objective.inverse_dynamics_coef * logged["train/inverse_dynamics_loss"]
         return total, logged
+
+    def _metric_loss(
+        self, batch: Batch, prediction: Prediction | None, variance: th.Tensor | None
+    ) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        """
+        :return: the loss and, for diagnosis, mu_bd and mu_rd (eq:reward-dependence2): mean distances of states and rewards
+        """
+        metric, z, rewards = self.objective.metric, batch.z, batch.rewards
+        other_z = z
+        if metric.target_encoder == "both":
+            assert batch.target_z is not None
+            other_z = batch.target_z
+        if metric.successors == "sample":
+            following = batch.next_z.detach() if metric.target_encoder == "none" else batch.target_next_z
+            successors: tuple[th.Tensor, th.Tensor | None] = (following, None)
+        else:
+            assert prediction is not None
+            successors = prediction.moments()
+        weights = None
+        if metric.absorbing:
+            # every successor is a row of its own, which follows itself without reward; only terminal ones count
+            weights = th.cat([th.ones_like(batch.dones), batch.dones])
+            ends, other_ends = batch.next_z, batch.next_z if other_z is z else batch.target_next_z
+            (mean, std), end = successors, ends.detach() if metric.target_encoder == "none" else batch.target_next_z
+            successors = th.cat([mean, end]), None if std is None else th.cat([std, th.zeros_like(std)])
+            z, other_z, rewards = th.cat([z, ends]), th.cat([other_z, other_ends]), th.cat([rewards, th.zeros_like(rewards)])
+            variance = None if variance is None else th.cat([variance, th.zeros_like(variance)])
+        gaps, (i, j) = metric.gaps(z, other_z, rewards, successors, variance)
+        losses_of_pairs = METRIC_LOSSES[metric.loss](gaps, metric.c_r, metric.c_t)
+
+        def mean_over_pairs(values: th.Tensor) -> th.Tensor:
+            if weights is None:
+                return values.mean()
+            weight = weights[i] * weights[j]
+            return (values * weight).sum() / (weight.sum() * values.shape[-1])
+
+        means = {"bisim/mu_bd": mean_over_pairs(gaps.z.detach()), "bisim/mu_rd": mean_over_pairs(gaps.reward)}
+        return mean_over_pairs(losses_of_pairs), means
 
     def bonus(self, z: th.Tensor, actions: th.Tensor, next_z: th.Tensor) -> th.Tensor:
         """

@@ -75,10 +75,10 @@ def test_what_would_be_taken_for_something_else_is_refused() -> None:
     x = th.ones(2, 3)
     with pytest.raises(ValueError, match=r"radius=-1\.0"):
         losses.project_to_ball(x, -1.0)
-    with pytest.raises(ValueError, match="distance='cosine'"):
-        losses.pairwise_distance(x, x, "cosine")
-    with pytest.raises(ValueError, match="distance='cosine'"):
-        losses.pairwise_distance(x, x, "cosine", x, x)
+    with pytest.raises(ValueError, match="distance='chebyshev'"):
+        losses.pairwise_distance(x, x, "chebyshev")
+    with pytest.raises(ValueError, match="distance='chebyshev'"):
+        losses.pairwise_distance(x, x, "chebyshev", x, x)
     with pytest.raises(ValueError, match="kind='gaussian'"):
         DynamicsModel(3, 1, "gaussian", None)
 
@@ -105,49 +105,6 @@ def test_the_radius_follows_from_c_r_c_t_and_the_reward_range(
     assert losses.ball_radius(c_r, c_t, reward_range) == pytest.approx(radius)
 
 
-@pytest.mark.parametrize("distance", losses.DISTANCES)
-@pytest.mark.parametrize("gaussian", [False, True])
-def test_metric_loss_is_the_papers_formula_written_as_loops(distance: str, gaussian: bool) -> None:
-    z, mean, raw = normal(3, 6, 4)
-    rewards, std = normal(6, 1, seed=1), raw.exp() if gaussian else None
-    pairs, c_r, c_t = th.tensor([3, 0, 5, 1, 2, 4]), 0.7, 0.9
-
-    def d(x: float) -> float:
-        return (0.5 * x**2 if abs(x) < 1 else abs(x) - 0.5) if distance == "huber" else abs(x)
-
-    def norm(x: list[float]) -> float:
-        return float(np.sqrt(np.square(x).sum()) if distance == "l2" else np.sum(x))
-
-    terms = []
-    for i, j in enumerate(pairs.tolist()):
-        reward_gap = d(float(rewards[i] - rewards[j]))
-        z_gaps = [d(float(x)) for x in z[i] - z[j]]
-        if std is None:
-            transition_gaps = [d(float(x)) for x in mean[i] - mean[j]]
-        else:
-            squares = (mean[i] - mean[j]) ** 2 + (std[i] - std[j]) ** 2
-            transition_gaps = [float(x) ** 0.5 for x in squares]
-        if distance == "huber":
-            terms += [(a - c_r * reward_gap - c_t * b) ** 2 for a, b in zip(z_gaps, transition_gaps, strict=True)]
-        else:
-            terms.append((norm(z_gaps) - c_r * reward_gap - c_t * norm(transition_gaps)) ** 2)
-    loss, mu_bd, mu_rd = losses.bisim_loss(z, rewards, mean, std, pairs, c_r, c_t, distance)
-    assert loss.item() == pytest.approx(np.mean(terms))
-    assert mu_bd.item() == pytest.approx(losses.pairwise_distance(z, z[pairs], distance).mean().item())
-    assert mu_rd.item() == pytest.approx(np.mean([d(float(rewards[i] - rewards[j])) for i, j in enumerate(pairs)]))
-
-
-@pytest.mark.parametrize("distance", losses.DISTANCES)
-def test_the_target_of_the_metric_loss_carries_no_gradient(distance: str) -> None:
-    z, rewards, mean, std = (normal(8, n, seed=n).requires_grad_() for n in (4, 1, 4, 4))
-    loss, *_ = losses.bisim_loss(z, rewards, mean, std.exp(), th.randperm(8), 1.0, 0.99, distance)
-    loss.backward()
-    assert z.grad.abs().sum() > 0
-    assert rewards.grad is None
-    assert mean.grad is None
-    assert std.grad is None
-
-
 def test_dynamics_loss_is_the_gaussian_log_likelihood_and_leaves_its_target_alone() -> None:
     mean, raw = normal(2, 3, 5, 4)
     target = normal(5, 4, seed=2).requires_grad_()
@@ -159,6 +116,24 @@ def test_dynamics_loss_is_the_gaussian_log_likelihood_and_leaves_its_target_alon
     loss.backward()
     assert mean.grad.abs().sum() > 0
     assert target.grad is None
+
+
+def test_beta_nll_weights_each_coordinate_by_its_spread() -> None:
+    mean, raw = normal(2, 3, 5, 4)
+    target, std = normal(5, 4, seed=2), raw.exp().requires_grad_()
+    loss = losses.dynamics_loss(mean, std, target, beta=0.5)
+    expected = (std.detach() * (0.5 * ((mean - target) / std.detach()).square() + std.detach().log())).mean()
+    assert loss.item() == pytest.approx(expected.item())
+    loss.backward()
+    # the weight carries no gradient: sigma's is that of the likelihood, weighted
+    th.testing.assert_close(std.grad, (1 - ((mean - target) / std.detach()).square()) / std.numel())
+
+
+def test_a_gaussian_reward_is_judged_by_its_likelihood() -> None:
+    mean, raw, rewards = normal(3, 6, 1)
+    expected = -th.distributions.Normal(mean, raw.exp()).log_prob(rewards).mean() - 0.5 * np.log(2 * np.pi)
+    assert losses.reward_loss(mean, raw.exp(), rewards).item() == pytest.approx(expected.item())
+    assert losses.reward_loss(mean, None, rewards).item() == pytest.approx((mean - rewards).square().mean().item())
 
 
 def test_inverse_dynamics_loss_is_the_l1_distance_per_action_dimension() -> None:

@@ -2,10 +2,12 @@
 
 import difflib
 import inspect
+import warnings
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import NStepReplayBuffer
@@ -25,6 +27,8 @@ def check_arguments(model: Any) -> None:
         value = getattr(model, name)
         _require(isinstance(value, (int, np.integer)) and value >= least, model, name, f"an integer >= {least}")
 
+    if model.bf16 and model.device.type == "cpu" and not th.ops.mkldnn._is_mkldnn_bf16_supported():
+        warnings.warn("bf16=True: this CPU has no bfloat16 instructions, so fp32 is several times faster.", stacklevel=4)
     _check_random_shift(model.random_shift, model.observation_space)
     n_steps = model.n_steps if model.n_steps != 1 else model.replay_buffer_kwargs.get("n_steps", 1)
     buffer_class = model.replay_buffer_class

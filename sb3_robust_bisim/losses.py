@@ -65,7 +65,8 @@ def huber(x: th.Tensor, y: th.Tensor, x_std: th.Tensor | None = None, y_std: th.
     their coordinates apart too: each coordinate has its own W2, sqrt(dmu^2 + dsigma^2).
     """
     if x_std is None or y_std is None:
-        return F.smooth_l1_loss(*th.broadcast_tensors(x, y), reduction="none")
+        x, y = th.broadcast_tensors(x, y)  # rewards of all pairs
+        return F.smooth_l1_loss(x, y, reduction="none")
     return _squared_w2(x, y, x_std, y_std).sqrt()
 
 

@@ -94,3 +94,9 @@ def test_bf16_encodes_almost_the_same_and_learns_in_fp32() -> None:
     bf16.learn(30)
     assert {param.dtype for param in bf16.policy.parameters()} == {th.float32}
     assert {param.grad.dtype for param in bf16.critic.parameters() if param.grad is not None} == {th.float32}
+
+
+def test_bf16_without_the_instructions_is_warned_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(th.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: False)
+    with pytest.warns(UserWarning, match="bf16=True: this CPU has no bfloat16 instructions"):
+        BisimSAC("MlpPolicy", ENV, bf16=True, device="cpu")

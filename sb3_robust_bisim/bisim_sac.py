@@ -1,38 +1,30 @@
 import inspect
-import io
-import pathlib
 from dataclasses import fields
-from typing import Any, ClassVar, TypeVar
+from typing import Any, Self
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import check_for_correct_spaces, polyak_update
 from stable_baselines3.sac.sac import SAC
 from torch.nn import functional as F
 
 from sb3_robust_bisim.checks import check_arguments, check_names
+from sb3_robust_bisim.heads import BisimActor, BisimCritic
 from sb3_robust_bisim.intrinsic_reward import bound, with_intrinsic_reward
-from sb3_robust_bisim.policies import BisimActor, BisimCritic, BisimPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
-from sb3_robust_bisim.representation import Objective
-from sb3_robust_bisim.runs.atomic import atomic_save
+from sb3_robust_bisim.objective import Objective
+from sb3_robust_bisim.policies import POLICIES, BisimPolicy
+from sb3_robust_bisim.runs.atomic import PathOrStream, atomic_save
 from sb3_robust_bisim.update_log import UpdateLog, unchecked_distributions
-
-SelfBisimSAC = TypeVar("SelfBisimSAC", bound="BisimSAC")
-PathOrStream = str | pathlib.Path | io.BufferedIOBase
 
 
 class BisimSAC(SAC):
     """
-    Soft Actor-Critic whose encoder is shaped by a robust on-policy bisimulation metric.
-
-    Paper: Towards Robust Bisimulation Metric Learning (Kemertas and Aumentado-Armstrong, NeurIPS 2021).
+    Soft Actor-Critic whose encoder is shaped by a robust on-policy bisimulation metric (Kemertas and Aumentado-Armstrong,
+    Towards Robust Bisimulation Metric Learning, NeurIPS 2021).
 
     One encoder z = phi(s), owned by the critic, is trained by critic, metric, dynamics, reward and inverse-dynamics loss in
-    one backward pass, and never by the actor loss. The paper's methods are settings: SAC ``bisim_coef=0,
-    norm_constraint=False``; DBC ``norm_constraint=False``; normed DBC the default; normed-IR adds ``intrinsic_reward_scale``,
-    normed-ID ``inverse_dynamics_coef``.
+    one backward pass, and never by the actor loss. zoo_configs/bisim_sac.yml names the settings of each method.
 
     :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a subclass of ``BisimPolicy``
     :param env: the environment, or its id
@@ -44,8 +36,7 @@ class BisimSAC(SAC):
     :param norm_constraint: hold embeddings and predictions in the L2 ball of eq:constraint, with radius
         c_R (R_max - R_min) / (2 (1 - c_T)). Between points of it only ``distance="l2"`` is at most the metric's diameter.
         "sphere": scale embeddings to length 1 (SimSR)
-    :param distance: "huber" (elementwise, the paper's experiments), "l1", "l2", "mico", "cosine" or "rap"; see
-        :mod:`sb3_robust_bisim.losses`
+    :param distance: "huber" (elementwise, the paper's), "l1", "l2", "mico", "cosine" or "rap"; :mod:`sb3_robust_bisim.losses`
     :param metric_kwargs: other settings of the metric, such as ``dict(successors="sample", pairs="all")``; see
         :class:`sb3_robust_bisim.metrics.Metric`
     :param dynamics: "deterministic", "probabilistic" (Gaussian) or "ensemble" (5 Gaussians)
@@ -74,11 +65,7 @@ class BisimSAC(SAC):
         model.learn(10_000, progress_bar=True)
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": MlpPolicy,
-        "CnnPolicy": CnnPolicy,
-        "MultiInputPolicy": MultiInputPolicy,
-    }
+    policy_aliases = POLICIES
     policy: BisimPolicy
     actor: BisimActor
     critic: BisimCritic
@@ -144,11 +131,9 @@ class BisimSAC(SAC):
         check_arguments(self)
         if self.env is not None:
             self.env = with_intrinsic_reward(self.env, self.observation_space, self.intrinsic_reward_scale)
-        # The policy learns of our own arguments here and not in __init__, so that `load(..., c_t=0.5)` reaches it, and
-        # the user's dict is saved as it was given
+        # here and not in __init__: `load(..., c_t=0.5)` reaches the policy, and the user's dict is saved as it was given
         policy_kwargs = self.policy_kwargs
-        own = {"objective": objective, "bf16": self.bf16, "random_shift": self.random_shift}
-        self.policy_kwargs = {**policy_kwargs, **own}
+        self.policy_kwargs = {**policy_kwargs, "objective": objective, "bf16": self.bf16, "random_shift": self.random_shift}
         super()._setup_model()
         self.policy_kwargs = policy_kwargs
 
@@ -269,15 +254,11 @@ class BisimSAC(SAC):
             log.add(self._n_updates, representation.statistics(batch.z.detach()))
             log.record(self.logger)
 
-    @th.no_grad()
     def _intrinsic_reward(self, obs: Any, actions: np.ndarray, next_obs: Any) -> np.ndarray:
-        """The bonus, (n_envs,), of transitions as the environment sees them: not normalised, actions in its own scale."""
+        """The bonus, (n_envs,), of transitions as the environment sees them: not normalised."""
         if self._vec_normalize_env is not None:
             obs, next_obs = self._vec_normalize_env.normalize_obs(obs), self._vec_normalize_env.normalize_obs(next_obs)
-        encode = self.critic.features_extractor.encode
-        z, next_z = (encode(self.policy.obs_to_tensor(o)[0]) for o in (obs, next_obs))
-        scaled_actions = th.as_tensor(self.policy.scale_action(actions), dtype=th.float32, device=self.device).flatten(1)
-        bonus = self.policy.representation.bonus(z, scaled_actions, next_z).cpu().numpy()
+        bonus = self.policy.bonus(obs, actions, next_obs)
         self.logger.record_mean("rollout/intrinsic_reward", bonus.mean(dtype=np.float64))
         return bonus
 
@@ -287,20 +268,20 @@ class BisimSAC(SAC):
         super().set_env(with_intrinsic_reward(env, self.observation_space, self.intrinsic_reward_scale), force_reset)
 
     @classmethod
-    def load(cls: type[SelfBisimSAC], path: PathOrStream, *args: Any, **kwargs: Any) -> SelfBisimSAC:
+    def load(cls, path: PathOrStream, *args: Any, **kwargs: Any) -> Self:
         """Like SB3's ``load``; arguments of BisimSAC replace what the model was saved with, and must exist."""
         check_names(cls, kwargs, inspect.signature(SAC.load).parameters)
         return super().load(path, *args, **kwargs)
 
     def learn(
-        self: SelfBisimSAC,
+        self,
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int = 4,
         tb_log_name: str = "BisimSAC",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
-    ) -> SelfBisimSAC:
+    ) -> Self:
         with bound(self.env, self._intrinsic_reward if self.intrinsic_reward_scale > 0 else None):
             return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 

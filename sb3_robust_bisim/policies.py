@@ -3,62 +3,24 @@
 from functools import partial
 from typing import Any, ClassVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.type_aliases import PyTorchObs, ReplayBufferSamples, Schedule
-from stable_baselines3.sac.policies import Actor, SACPolicy
+from stable_baselines3.common.type_aliases import ReplayBufferSamples, Schedule
+from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
 from sb3_robust_bisim.augmentation import random_shift
 from sb3_robust_bisim.encoders import CombinedEncoder, Encoded, Encoder, MlpEncoder, PixelEncoder
+from sb3_robust_bisim.heads import BisimActor, BisimCritic
 from sb3_robust_bisim.latent_models import RELU
-from sb3_robust_bisim.representation import Batch, Objective, Representation
+from sb3_robust_bisim.objective import Objective
+from sb3_robust_bisim.representation import Batch, Representation
 
-# Bounds of the actor's log standard deviation, reached smoothly through a tanh
-LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
 INVERSE_DYNAMICS_ADAM = dict(lr=1e-4, weight_decay=1e-5)
-
-
-class BisimActor(Actor):
-    """
-    SAC's actor, which takes observations that have been encoded as well.
-
-    :param detach_features: whether the encoder belongs to the critic, so that no gradient may reach it from here
-    """
-
-    features_extractor: Encoder
-
-    def __init__(self, *args: Any, detach_features: bool = True, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.detach_features = detach_features
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "detach_features": self.detach_features}
-
-    def extract_features(self, obs: PyTorchObs | Encoded, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
-        with th.set_grad_enabled(th.is_grad_enabled() and not self.detach_features):
-            features = self.features_extractor.encode(obs)
-        return features.detach() if self.detach_features else features
-
-    def get_action_dist_params(self, obs: PyTorchObs | Encoded) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
-        latent_pi = self.latent_pi(self.extract_features(obs, self.features_extractor))
-        mean_actions = self.mu(latent_pi)
-        if self.use_sde:
-            return mean_actions, self.log_std, dict(latent_sde=latent_pi)
-        log_std = th.tanh(self.log_std(latent_pi))  # type: ignore[operator]
-        return mean_actions, LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (log_std + 1), {}
-
-
-class BisimCritic(ContinuousCritic):
-    """SAC's critic, owner of the encoder, which takes observations that have been encoded as well."""
-
-    features_extractor: Encoder
-
-    def extract_features(self, obs: PyTorchObs | Encoded, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
-        return self.features_extractor.encode(obs)
 
 
 class BisimPolicy(SACPolicy):
@@ -161,6 +123,20 @@ class BisimPolicy(SACPolicy):
         batch = Batch(z, replay_data.actions, replay_data.rewards, replay_data.dones, next_z, target_next_z, target_z)
         return replay_data._replace(observations=obs, next_observations=next_obs), batch  # type: ignore[arg-type]
 
+    @th.no_grad()
+    def bonus(self, obs: Any, actions: np.ndarray, next_obs: Any) -> np.ndarray:
+        """
+        The intrinsic reward of transitions (sec:intrinsic).
+
+        :param obs: observations as the policy takes them, n rows
+        :param actions: (n, n_a) in the scale of the action space
+        :param next_obs: true successors, n rows
+        :return: (n,)
+        """
+        z, next_z = (self.critic.features_extractor.encode(self.obs_to_tensor(o)[0]) for o in (obs, next_obs))
+        scaled = th.as_tensor(self.scale_action(actions), dtype=th.float32, device=self.device).flatten(1)
+        return self.representation.bonus(z, scaled, next_z).cpu().numpy()
+
     def actor_parameters(self) -> list[nn.Parameter]:
         """What the actor loss trains: all of the actor but an encoder that the critic owns, and what has been frozen."""
         shared = set(self.critic.features_extractor.parameters()) if self.share_features_extractor else set()
@@ -209,6 +185,9 @@ class MultiInputPolicy(BisimPolicy):
     """:class:`BisimPolicy` for Dict observations: the encoder is :class:`CombinedEncoder` by default."""
 
     default_encoder = CombinedEncoder
+
+
+POLICIES: dict[str, type[BasePolicy]] = {"MlpPolicy": MlpPolicy, "CnnPolicy": CnnPolicy, "MultiInputPolicy": MultiInputPolicy}
 
 
 def _fused(adam_kwargs: dict[str, Any]) -> dict[str, Any]:

@@ -9,9 +9,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from small_models import SMALL, pendulum
+from small_models import SMALL, dicts, images, make_model, pendulum
 from stable_baselines3.common.buffers import NStepReplayBuffer
-from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv, SimpleMultiObsEnv
+from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 from stable_baselines3.sac.policies import SACPolicy
@@ -24,18 +24,6 @@ NAN, INF = float("nan"), float("inf")
 
 def venv() -> VecEnv:
     return DummyVecEnv([pendulum])
-
-
-def images() -> gym.Env:
-    return FakeImageEnv(screen_height=12, screen_width=12, n_channels=1, discrete=False)
-
-
-def dicts() -> gym.Env:
-    return SimpleMultiObsEnv(discrete_actions=False)
-
-
-def make_model(policy: Any = "MlpPolicy", env: Any = None, **kwargs: Any) -> Any:
-    return BisimSAC(policy, pendulum() if env is None else env, **{**SMALL, **kwargs})
 
 
 WEIGHTS = ("bisim_coef", "c_r", "model_coef", "intrinsic_reward_scale", "intrinsic_reward_max", "inverse_dynamics_coef")

@@ -10,12 +10,12 @@ import pytest
 import torch as th
 import yaml
 from rl_zoo3.utils import get_callback_list
+from small_models import SMALL, events
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_robust_bisim import BisimSAC
 from sb3_robust_bisim.callbacks import DenoisingFactorCallback, EmbeddingCallback, ValueBoundCallback, diagnostic
@@ -24,9 +24,7 @@ from sb3_robust_bisim.cli import zoo
 from sb3_robust_bisim.envs import NoiseObservation
 from sb3_robust_bisim.runs.checkpoint import Checkpoint, load_checkpoint
 
-SETTINGS: dict[str, Any] = dict(
-    policy_kwargs=dict(net_arch=[16]), learning_starts=20, batch_size=16, buffer_size=200, train_freq=10, seed=0
-)
+SETTINGS: dict[str, Any] = {**SMALL, "learning_starts": 20, "batch_size": 16, "buffer_size": 200, "train_freq": 10}
 NOISY = "robust_bisim/SparseCartPole-v0"
 
 
@@ -91,12 +89,6 @@ class FlatEncoder(th.nn.Module):
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
         return th.nn.functional.pad(obs.flatten(1)[:, self.where], (0, 48))
-
-
-def events(folder: Path) -> EventAccumulator:
-    accumulator = EventAccumulator(str(folder / "BisimSAC_1"), size_guidance={"images": 0})
-    accumulator.Reload()
-    return accumulator
 
 
 def scalars(folder: Path, key: str) -> np.ndarray:

@@ -5,12 +5,13 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch as th
 import yaml
-from small_models import SMALL
+from small_models import make_model
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.env_util import make_vec_env
@@ -25,7 +26,7 @@ from sb3_robust_bisim.runs.atomic import atomic_path
 from sb3_robust_bisim.runs.checkpoint import Checkpoint, load_checkpoint, read_about, save_checkpoint
 
 STEPS = 120
-LEARNING = {**SMALL, "learning_starts": 20, "buffer_size": 200}
+LEARNING: dict[str, Any] = dict(learning_starts=20, buffer_size=200)
 
 
 class StopAt(BaseCallback):
@@ -51,8 +52,8 @@ def pixel_task() -> VecEnv:
 
 def model_of(task: str) -> BisimSAC:
     if task == "state":
-        return BisimSAC("MlpPolicy", state_task(), **LEARNING)
-    return BisimSAC("CnnPolicy", pixel_task(), replay_buffer_class=FrameStackReplayBuffer, **LEARNING)
+        return make_model("MlpPolicy", state_task(), **LEARNING)
+    return make_model("CnnPolicy", pixel_task(), replay_buffer_class=FrameStackReplayBuffer, **LEARNING)
 
 
 @pytest.mark.parametrize("task", ["state", "pixels"])
@@ -76,7 +77,7 @@ def test_training_goes_on_as_if_it_had_never_stopped(task: str, tmp_path: Path) 
 def test_a_monitor_file_has_each_episode_once(tmp_path: Path) -> None:
     def model(folder: Path) -> BisimSAC:
         venv = make_vec_env("robust_bisim/SparseCartPole-v0", 1, seed=3, monitor_dir=str(folder))
-        return BisimSAC("MlpPolicy", venv, **LEARNING)
+        return make_model(env=venv, **LEARNING)
 
     def episodes(folder: Path) -> list[tuple[str, ...]]:
         return [tuple(line.split(",")[:2]) for line in (folder / "0.monitor.csv").read_text().splitlines()[1:]]
@@ -111,7 +112,7 @@ def test_environments_that_cannot_be_kept_are_refused_at_the_start(
     env: str, venv_class: type[VecEnv], message: str, tmp_path: Path
 ) -> None:
     venv = make_vec_env(env, 1, vec_env_cls=venv_class)
-    model = BisimSAC("MlpPolicy", venv, **LEARNING)
+    model = make_model(env=venv, **LEARNING)
     with pytest.raises(ValueError, match=message):
         model.learn(30, callback=Checkpoint(tmp_path / "checkpoint.pkl", 100))
     with pytest.raises(ValueError, match=message):
@@ -123,8 +124,8 @@ def test_environments_that_cannot_be_kept_are_refused_at_the_start(
 def test_hindsight_replay_goes_on_as_well(tmp_path: Path) -> None:
     def model() -> BisimSAC:
         env = BitFlippingEnv(n_bits=4, continuous=True)
-        settings = {**LEARNING, "intrinsic_reward_scale": 0.0, "replay_buffer_class": HerReplayBuffer}
-        return BisimSAC("MultiInputPolicy", env, **settings)
+        settings = dict(intrinsic_reward_scale=0.0, replay_buffer_class=HerReplayBuffer)
+        return make_model("MultiInputPolicy", env, **LEARNING, **settings)
 
     expected = model().learn(60)
     model().learn(60, callback=CallbackList([Checkpoint(tmp_path / "checkpoint.pkl", 30), StopAt(40)]))
@@ -145,7 +146,7 @@ with atomic_path({str(path)!r}, alone=True) as temporary:
 """
     assert subprocess.run([sys.executable, "-c", script], timeout=300).returncode == -signal.SIGKILL
     assert len(list(tmp_path.iterdir())) == 1
-    save_checkpoint(path, BisimSAC("MlpPolicy", "Pendulum-v1", **LEARNING))
+    save_checkpoint(path, make_model(**LEARNING))
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pkl"]
     assert read_about(path)["num_timesteps"] == 0
 
@@ -210,14 +211,14 @@ def test_a_run_that_goes_on_may_become_longer(command: list[str], capsys: pytest
 
 def test_a_checkpoint_of_other_versions_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sb3_robust_bisim.runs.checkpoint._versions", lambda: {"torch": "1.0"})
-    save_checkpoint(tmp_path / "checkpoint.pkl", BisimSAC("MlpPolicy", "Pendulum-v1", **LEARNING))
+    save_checkpoint(tmp_path / "checkpoint.pkl", make_model(**LEARNING))
     monkeypatch.undo()
     with pytest.raises(ValueError, match=r"needs the versions that it was written with: .*torch is 1\.0 there and 2"):
         load_checkpoint(tmp_path / "checkpoint.pkl")
 
 
 def test_a_checkpoint_of_a_gpu_that_is_not_here_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    save_checkpoint(tmp_path / "checkpoint.pkl", BisimSAC("MlpPolicy", "Pendulum-v1", **LEARNING), about={"name": "a"})
+    save_checkpoint(tmp_path / "checkpoint.pkl", make_model(**LEARNING), about={"name": "a"})
     assert read_about(tmp_path / "checkpoint.pkl")["gpus"] == 0
     with (tmp_path / "checkpoint.pkl").open("rb") as file:
         header, rest = pickle.load(file), file.read()
@@ -234,13 +235,13 @@ def test_another_file_is_refused_by_name(command: list[str], tmp_path: Path) -> 
     path.write_bytes(pickle.dumps([1, 2]))
     with pytest.raises(ValueError, match=r"checkpoint\.pkl: this is no checkpoint, but some other pickle"):
         zoo.main([*command, "--seed", "3"])
-    save_checkpoint(path, BisimSAC("MlpPolicy", "Pendulum-v1", **LEARNING))
+    save_checkpoint(path, make_model(**LEARNING))
     with pytest.raises(ValueError, match=r"--checkpoint .*checkpoint\.pkl: saved from Python, not by this command"):
         zoo.main([*command, "--seed", "3"])
 
 
 def test_training_goes_on_although_a_logger_had_been_set(tmp_path: Path) -> None:
-    model = BisimSAC("MlpPolicy", "Pendulum-v1", **LEARNING)
+    model = make_model(**LEARNING)
     model.set_logger(configure(str(tmp_path), ["csv"]))
     model.learn(40, callback=Checkpoint(tmp_path / "checkpoint.pkl", 30))
     assert load_checkpoint(tmp_path / "checkpoint.pkl")[0].learn(10, reset_num_timesteps=False).num_timesteps == 40

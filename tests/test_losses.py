@@ -1,14 +1,18 @@
 """The mathematics: each loss against an independent computation."""
 
+from pathlib import Path
+
 import numpy as np
 import ot
 import pytest
 import torch as th
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_models import EPISODE, events, make_model, parameters
 
 from sb3_robust_bisim import losses
-from sb3_robust_bisim.latent_models import DynamicsModel
+from sb3_robust_bisim.callbacks import ValueBoundCallback
+from sb3_robust_bisim.latent_models import DYNAMICS, DynamicsModel
 
 SETTINGS = settings(max_examples=50, deadline=None, derandomize=True)
 
@@ -81,6 +85,26 @@ def test_what_would_be_taken_for_something_else_is_refused() -> None:
         losses.pairwise_distance(x, x, "cosine", x, x)
     with pytest.raises(ValueError, match="kind='gaussian'"):
         DynamicsModel(3, 1, "gaussian", None)
+
+
+@pytest.mark.parametrize("dynamics", DYNAMICS)
+def test_a_distance_works_everywhere_once_distances_holds_its_function(
+    dynamics: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The new distance is half of l2. So what any other function measures for it has the wrong ratio to l2."""
+    monkeypatch.setitem(losses.DISTANCES, "half of l2", lambda *args: losses.l2(*args) / 2)
+    found = []
+    for distance in ("l2", "half of l2"):
+        folder = tmp_path / distance
+        model = make_model(distance=distance, dynamics=dynamics, tensorboard_log=str(folder))
+        model.learn(EPISODE, callback=ValueBoundCallback(n_states=20))  # no update yet: both embed alike
+        model.logger.close()
+        model.train(gradient_steps=1, batch_size=8)
+        logged = model.logger.name_to_value
+        assert th.isfinite(parameters(model.policy)).all()
+        bound = events(folder).Scalars("bisim/value_bound")[0].value
+        found.append([bound, logged["bisim/mu_bd"], logged["bisim/mu_rd"], logged["train/bisim_loss"]])
+    np.testing.assert_allclose(np.array(found[1]) / found[0], [0.5, 0.5, 0.5, 0.25], rtol=1e-5)
 
 
 def test_what_was_outside_is_told_from_what_was_inside() -> None:

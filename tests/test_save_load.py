@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
-from small_models import SMALL, pendulum
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecNormalize
+from small_models import layers, make_model, pendulum
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_robust_bisim import BisimSAC, IntrinsicRewardVecEnv
 from sb3_robust_bisim.policies import MlpPolicy
@@ -28,14 +28,10 @@ STATE_DICTS = {
 }
 
 
-def make_model(**kwargs: Any) -> Any:
-    return BisimSAC("MlpPolicy", **{"env": pendulum(), **SMALL, "initial_gradient_steps": 3, **kwargs})
-
-
 @pytest.fixture(scope="module")
 def trained() -> Any:
     """A model after 10 random steps and 3 + 4 updates; not to be changed."""
-    return make_model().learn(15)
+    return make_model(initial_gradient_steps=3).learn(15)
 
 
 @pytest.fixture
@@ -49,12 +45,7 @@ def actions_of(model: Any) -> np.ndarray:
 
 
 def bonus_layers(model: Any) -> list[IntrinsicRewardVecEnv]:
-    layers, layer = [], model.get_env()
-    while isinstance(layer, VecEnvWrapper):
-        if isinstance(layer, IntrinsicRewardVecEnv):
-            layers.append(layer)
-        layer = layer.venv
-    return layers
+    return [layer for layer in layers(model.get_env()) if isinstance(layer, IntrinsicRewardVecEnv)]
 
 
 def bonuses(model: Any, steps: int = 3) -> list[float | None]:

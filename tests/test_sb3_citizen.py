@@ -1,6 +1,7 @@
 """BisimSAC keeps the contract of a Stable-Baselines3 algorithm, with bonus and inverse dynamics switched on."""
 
 from copy import deepcopy
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,9 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from small_models import EPISODE, SMALL, pendulum
+from small_models import EPISODE, dicts, images, make_model, parameters, pendulum, with_data
 from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
-from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv, SimpleMultiObsEnv
+from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize, VecTransposeImage, is_vecenv_wrapped
@@ -24,28 +25,8 @@ from sb3_robust_bisim.encoders import MlpEncoder
 from sb3_robust_bisim.latent_models import DYNAMICS
 from sb3_robust_bisim.losses import DISTANCES
 
-
-def unpaid_pendulum() -> gym.Env:
-    """A pendulum without reward: what the replay buffer holds is the bonus alone."""
-    return gym.wrappers.TransformReward(pendulum(), lambda reward: 0.0)
-
-
-def images() -> gym.Env:
-    return FakeImageEnv(screen_height=12, screen_width=12, n_channels=1, discrete=False)
-
-
-def make_model(policy: str = "MlpPolicy", env: Any = None, **kwargs: Any) -> Any:
-    """A small BisimSAC; typed as Any, since half of an algorithm's attributes are Optional."""
-    return BisimSAC(policy, pendulum() if env is None else env, **{**SMALL, "buffer_size": 100, **kwargs})
-
-
-def with_data(*args: Any, **kwargs: Any) -> Any:
-    """A model that has gathered random transitions and not yet trained, for tests that call ``train`` themselves."""
-    return make_model(*args, **{"learning_starts": 1000, **kwargs}).learn(20)
-
-
-def parameters(module: nn.Module) -> th.Tensor:
-    return nn.utils.parameters_to_vector(module.parameters()).detach().clone()
+# Without reward of its own, so that the replay buffer holds the bonus alone
+unpaid_pendulum = partial(pendulum, reward=0.0)
 
 
 def learning_rate_of(optimizer: th.optim.Optimizer | None) -> float:
@@ -151,7 +132,7 @@ def test_the_target_encoder_stays_at_tau_0_and_is_a_copy_at_tau_1(tau: float, sh
 
 
 def test_dict_observations_train_with_the_multi_input_policy() -> None:
-    env = SimpleMultiObsEnv(discrete_actions=False)
+    env = dicts()
     model = make_model("MultiInputPolicy", env).learn(EPISODE + 3)
     assert model._n_updates == 3
     obs, _ = env.reset()
@@ -196,9 +177,7 @@ def test_observations_may_be_normalised(bonus: bool) -> None:
 
 
 def test_evaluation_under_vecnormalize_shares_its_statistics_and_sees_no_bonus() -> None:
-    def paid() -> gym.Env:
-        return gym.wrappers.TransformReward(pendulum(), lambda reward: 1.0)
-
+    paid = partial(pendulum, reward=1.0)
     env: Any = VecNormalize(IntrinsicRewardVecEnv(DummyVecEnv([paid])), norm_reward=False)
     eval_env: Any = VecNormalize(IntrinsicRewardVecEnv(DummyVecEnv([paid])), norm_reward=False, training=False)
     callback = EvalCallback(eval_env, eval_freq=20, n_eval_episodes=2, verbose=0, warn=False)
@@ -354,23 +333,22 @@ def test_images_that_are_floats_already_are_encoded_as_they_are() -> None:
     class FloatImages(gym.ObservationWrapper):
         def __init__(self, env: gym.Env) -> None:
             super().__init__(env)
-            self.observation_space = gym.spaces.Box(0, 1, (1, 36, 36), np.float32)
+            self.observation_space = spaces.Box(0, 1, (1, 12, 12), np.float32)
 
         def observation(self, observation: np.ndarray) -> np.ndarray:
-            return observation.reshape(1, 36, 36).astype(np.float32) / 255
+            return observation.reshape(1, 12, 12).astype(np.float32) / 255
 
-    env = FloatImages(FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False, channel_first=True))
     policy_kwargs = dict(normalize_images=False, net_arch=[16])
-    model = BisimSAC("CnnPolicy", env, buffer_size=50, learning_starts=10, batch_size=4, policy_kwargs=policy_kwargs).learn(14)
+    model = make_model("CnnPolicy", FloatImages(images()), policy_kwargs=policy_kwargs).learn(EPISODE + 4)
     encoder, seen = model.critic.features_extractor, []
     encoder.extractor.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
-    obs = th.rand(2, 1, 36, 36)
+    obs = th.rand(2, 1, 12, 12)
     encoder.encode(obs)
     assert th.equal(seen[0], obs)  # not divided by 255
 
 
 def test_one_setting_of_the_inverse_dynamics_optimizer_leaves_the_others() -> None:
     policy_kwargs = dict(inverse_dynamics_optimizer_kwargs=dict(weight_decay=0.0, foreach=True), net_arch=[16])
-    policy = BisimSAC("MlpPolicy", "Pendulum-v1", policy_kwargs=policy_kwargs).policy
+    policy = make_model(policy_kwargs=policy_kwargs).policy
     group = policy.representation.inverse_dynamics.optimizer.param_groups[0]
     assert (group["lr"], group["weight_decay"], group["foreach"]) == (1e-4, 0.0, True)

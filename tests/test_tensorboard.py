@@ -1,18 +1,18 @@
 """What BisimSAC writes for TensorBoard is there, finite, and means what its name says."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
+from small_models import EPISODE, SMALL, events, pendulum
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_robust_bisim import BisimSAC
 
-EPISODE, BATCH_SIZE = 10, 8
+BATCH_SIZE = SMALL["batch_size"]
 SB3_KEYS = {"train/learning_rate", "rollout/ep_rew_mean", "rollout/ep_len_mean", "time/fps"}
 SAC_KEYS = {"train/critic_loss", "train/actor_loss", "train/ent_coef", "train/ent_coef_loss"}
 EMBEDDING_KEYS = {"bisim/embedding_norm_mean", "bisim/embedding_norm_max", "bisim/embedding_std"}
@@ -34,23 +34,14 @@ class Bonuses(BaseCallback):
         return True
 
 
-def paid_pendulum() -> gym.Env:
-    """Every step of it pays 0.5, so that an episode returns 5."""
-    return gym.wrappers.TransformReward(gym.make("Pendulum-v1", max_episode_steps=EPISODE), lambda reward: 0.5)
-
-
 def run(folder: Path, callback: BaseCallback | None = None, **kwargs: Any) -> dict[str, np.ndarray]:
     """What three episodes in each of two environments write, by key: one value per pair of episodes."""
-    settings: dict[str, Any] = dict(
-        policy_kwargs=dict(net_arch=[16]), learning_starts=EPISODE, batch_size=BATCH_SIZE, buffer_size=100, seed=0
-    )
-    env = make_vec_env(paid_pendulum, n_envs=2)
-    model = BisimSAC("MlpPolicy", env, tensorboard_log=str(folder), train_freq=2, gradient_steps=3, **settings, **kwargs)
+    env = make_vec_env(partial(pendulum, reward=0.5), n_envs=2)
+    model = BisimSAC("MlpPolicy", env, tensorboard_log=str(folder), train_freq=2, gradient_steps=3, **SMALL, **kwargs)
     model.learn(2 * 3 * EPISODE, callback, log_interval=2)
     model.logger.close()
-    events = EventAccumulator(str(folder / "BisimSAC_1"))
-    events.Reload()
-    return {key: np.array([event.value for event in events.Scalars(key)]) for key in events.Tags()["scalars"]}
+    found = events(folder)
+    return {key: np.array([event.value for event in found.Scalars(key)]) for key in found.Tags()["scalars"]}
 
 
 @pytest.fixture(scope="module")

@@ -57,7 +57,8 @@ def test_an_update_is_that_of_the_equations(dynamics: str) -> None:
     model.train(gradient_steps=1)
     logged = model.logger.name_to_value
 
-    th.manual_seed(1)  # next actions, a sample of the model, pairs and actions are drawn in this order
+    th.manual_seed(1)  # actions, next actions, a sample of the model and pairs are drawn in this order
+    sampled_actions, log_prob = old.actor.action_log_prob(obs)
     z, next_z = old.critic.features_extractor.encode(obs), old.critic.features_extractor.encode(next_obs)
     with th.no_grad():
         next_actions, next_log_prob = old.actor.action_log_prob(next_obs)
@@ -89,7 +90,6 @@ def test_an_update_is_that_of_the_equations(dynamics: str) -> None:
     assert_close(trained[0], descended(total, trained[1]))
 
     # the actor sees the new critics, on the embedding that the old encoder gave
-    sampled_actions, log_prob = old.actor.action_log_prob(obs)
     q = th.minimum(*q_values(model.critic, z.detach(), sampled_actions))
     actor_loss = (ALPHA * log_prob[:, None] - q).mean()
     assert logged["train/actor_loss"] == pytest.approx(actor_loss.item(), rel=1e-4)

@@ -3,22 +3,15 @@
 from collections.abc import Callable
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3.common.envs import FakeImageEnv
+from small_models import images, make_model, with_data
 from torch.distributions import Distribution
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from sb3_robust_bisim import BisimSAC
 from sb3_robust_bisim.update_log import unchecked_distributions
-
-ENV = "robust_bisim/SparseCartPole-v0"
-EVERYTHING: dict[str, Any] = dict(
-    intrinsic_reward_scale=1.0, inverse_dynamics_coef=1.0, learning_starts=20, batch_size=8, seed=0
-)
 
 
 class Reads(TorchDispatchMode):
@@ -54,7 +47,7 @@ class Transfers(TorchFunctionMode):
 @pytest.mark.parametrize("use_sde", [False, True])
 def test_no_gradient_step_waits_for_the_device(dynamics: str, use_sde: bool) -> None:
     # a fixed entropy coefficient: Adam keeps the step counts of its default form on the CPU, and reads them there
-    model = BisimSAC("MlpPolicy", ENV, ent_coef=0.1, dynamics=dynamics, use_sde=use_sde, **EVERYTHING).learn(20)
+    model = with_data(ent_coef=0.1, dynamics=dynamics, use_sde=use_sde)
     with Reads() as reads, Transfers() as transfers:
         model.train(gradient_steps=6, batch_size=8)
     assert reads.count == 0
@@ -81,11 +74,9 @@ def test_the_settings_of_torch_are_restored_also_after_an_error() -> None:
 
 
 def test_bf16_encodes_almost_the_same_and_learns_in_fp32() -> None:
-    def make_env() -> gym.Env:
-        return FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False)
-
-    fp32, bf16 = (BisimSAC("CnnPolicy", make_env(), buffer_size=100, bf16=on, **EVERYTHING) for on in (False, True))
-    obs = fp32.policy.obs_to_tensor(np.stack([make_env().observation_space.sample() for _ in range(8)]))[0]
+    fp32, bf16 = (make_model("CnnPolicy", images(), bf16=on) for on in (False, True))
+    space = images().observation_space
+    obs = fp32.policy.obs_to_tensor(np.stack([space.sample() for _ in range(8)]))[0]
     with th.no_grad():
         exact, rounded = fp32.critic.features_extractor.encode(obs), bf16.critic.features_extractor.encode(obs)
     assert rounded.dtype == th.float32

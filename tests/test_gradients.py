@@ -1,4 +1,4 @@
-"""Who trains what: each loss moves the parameters it should and no others."""
+"""Each loss trains the parameters that it should train and no others."""
 
 from typing import Any
 
@@ -27,7 +27,7 @@ def nets(model: BisimSAC) -> dict[str, nn.Module]:
 
 
 def with_gradient(model: BisimSAC) -> set[str]:
-    """Names of the nets that hold a gradient other than 0."""
+    """Names of the nets with a gradient other than 0."""
     return {
         name
         for name, net in nets(model).items()
@@ -80,14 +80,14 @@ def test_the_inverse_loss_reaches_the_encoder_through_both_observations() -> Non
 def test_the_actor_loss_leaves_no_gradient_outside_the_actor() -> None:
     model = trained(policy_delay=1)
     before = all_parameters(model)
-    # the other optimizers stand still: whatever moves was moved by the actor loss
+    # the other optimizers do nothing, so only the actor loss can move parameters
     for optimizer in (model.critic.optimizer, model.policy.representation.inverse_dynamics.optimizer):
         optimizer.step = lambda: None
     model.tau = 0.0
     original = model.actor.optimizer.zero_grad
 
     def spy() -> None:
-        """Between the two backward passes: forget what the representation losses left."""
+        """Runs between the two backward passes and forgets the gradients of the representation losses."""
         model.policy.zero_grad()
         original()
 
@@ -97,7 +97,7 @@ def test_the_actor_loss_leaves_no_gradient_outside_the_actor() -> None:
     assert moved(model, before) == {"actor"}
 
 
-def test_an_actor_with_its_own_encoder_trains_that_one_alone() -> None:
+def test_an_actor_with_its_own_encoder_trains_only_that_encoder() -> None:
     model = trained(policy_kwargs=dict(net_arch=[16], share_features_extractor=False), policy_delay=1)
     original = model.actor.optimizer.zero_grad
     model.actor.optimizer.zero_grad = lambda: (model.policy.zero_grad(), original())[1]
@@ -107,8 +107,8 @@ def test_an_actor_with_its_own_encoder_trains_that_one_alone() -> None:
     assert not th.equal(before, parameters(model.actor.features_extractor))
 
 
-def test_training_moves_everything_and_the_target_follows() -> None:
-    # steps so large that a target which lags by more or less than tau would be far away
+def test_training_moves_everything_and_the_target_follows_by_tau() -> None:
+    # steps this large reveal a target that follows by more or less than tau
     model = trained(dynamics="probabilistic", policy_delay=1, tau=0.3, learning_rate=0.01)
     before = all_parameters(model)
     model.train(gradient_steps=1, batch_size=16)
@@ -118,7 +118,7 @@ def test_training_moves_everything_and_the_target_follows() -> None:
     th.testing.assert_close(target, old + model.tau * (new - old), rtol=1e-5, atol=1e-7)
 
 
-def test_without_extras_only_sac_and_its_encoder_learn() -> None:
+def test_only_sac_and_its_encoder_learn_without_extras() -> None:
     model = trained(bisim_coef=0.0, norm_constraint=False, intrinsic_reward_scale=0.0, inverse_dynamics_coef=0.0)
     before = all_parameters(model)
     model.train(gradient_steps=4, batch_size=16)

@@ -2,25 +2,13 @@
 
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
+from small_models import dicts, images, make_model, pendulum
 
 from sb3_robust_bisim import BisimSAC
 from sb3_robust_bisim.augmentation import random_shift
-
-
-def images() -> gym.Env:
-    return FakeImageEnv(screen_height=36, screen_width=36, n_channels=3, discrete=False)
-
-
-def make_model(policy: str = "CnnPolicy", env: gym.Env | None = None, **kwargs: Any) -> Any:
-    settings: dict[str, Any] = dict(
-        buffer_size=50, learning_starts=10, batch_size=8, seed=0, policy_kwargs=dict(net_arch=[16])
-    )
-    return BisimSAC(policy, env or images(), **{**settings, **kwargs})
 
 
 @pytest.mark.parametrize("dtype", [th.uint8, th.float32])
@@ -51,7 +39,7 @@ def test_no_padding_changes_nothing() -> None:
 
 
 def test_training_shifts_both_observations_apart_and_acting_does_not() -> None:
-    model = make_model(random_shift=4).learn(12)
+    model = make_model("CnnPolicy", images(), random_shift=4).learn(12)
     seen: list[th.Tensor] = []
     model.critic.features_extractor.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0].clone()))
     data = model.replay_buffer.sample(8)
@@ -67,7 +55,7 @@ def test_training_shifts_both_observations_apart_and_acting_does_not() -> None:
 
 
 def test_without_a_shift_the_batch_stays_as_it_is() -> None:
-    model = make_model().learn(12)
+    model = make_model("CnnPolicy", images()).learn(12)
     data = model.replay_buffer.sample(8)
     encoded, _ = model.policy.encode(data)
     assert th.equal(encoded.observations.preprocessed, data.observations.float() / 255)
@@ -78,16 +66,16 @@ def test_without_a_shift_the_batch_stays_as_it_is() -> None:
     [
         (dict(random_shift=-1), "random_shift=-1: it must be an integer in"),
         (dict(random_shift=1.5), r"random_shift=1\.5: it must be an integer in"),
-        (dict(random_shift=36), r"random_shift=36: it must be an integer in \[0, 35\]"),
-        (dict(random_shift=4, policy="MlpPolicy", env=gym.make("Pendulum-v1")), "random_shift=4 .* it needs images"),
-        (dict(random_shift=4, policy="MultiInputPolicy", env=SimpleMultiObsEnv(discrete_actions=False)), "random_shift=4"),
+        (dict(random_shift=12), r"random_shift=12: it must be an integer in \[0, 11\]"),
+        (dict(random_shift=4, policy="MlpPolicy", env=pendulum()), "random_shift=4 .* it needs images"),
+        (dict(random_shift=4, policy="MultiInputPolicy", env=dicts()), "random_shift=4"),
     ],
 )
 def test_a_shift_that_makes_no_sense_is_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        make_model(**arguments)
+        make_model(**{"policy": "CnnPolicy", "env": images(), **arguments})
 
 
 def test_the_setting_survives_saving(tmp_path: Any) -> None:
-    make_model(random_shift=2).save(tmp_path / "model")
+    make_model("CnnPolicy", images(), random_shift=2).save(tmp_path / "model")
     assert BisimSAC.load(tmp_path / "model", env=images()).policy.random_shift == 2

@@ -1,4 +1,4 @@
-"""The house rules that a machine can check: who may import whom, and how much of SB3's SAC stands in `train`."""
+"""The house rules that a machine can check: allowed imports, and how much of SB3's `SAC.train` our `train` keeps."""
 
 import ast
 import difflib
@@ -43,7 +43,7 @@ def floor_of(module: str) -> str:
 
 
 def imports() -> dict[str, set[str]]:
-    """For each file or folder of the package what it imports of the others, type-only imports included."""
+    """What each file or folder of the package imports from the others, including type-only imports."""
     found: dict[str, set[str]] = {}
     for path in PACKAGE.rglob("*.py"):
         name = path.relative_to(PACKAGE).parts[0].removesuffix(".py")

@@ -1,4 +1,6 @@
-"""The mathematics: each loss against an independent computation."""
+"""Each loss agrees with an independent computation."""
+
+from pathlib import Path
 
 import numpy as np
 import ot
@@ -6,9 +8,11 @@ import pytest
 import torch as th
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_models import EPISODE, events, make_model, parameters, pendulum
 
 from sb3_robust_bisim import losses
-from sb3_robust_bisim.latent_models import DynamicsModel
+from sb3_robust_bisim.callbacks import ValueBoundCallback
+from sb3_robust_bisim.latent_models import DYNAMICS, DynamicsModel
 
 SETTINGS = settings(max_examples=50, deadline=None, derandomize=True)
 
@@ -19,7 +23,7 @@ def normal(*shape: int, seed: int = 0) -> th.Tensor:
 
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 12))
 @SETTINGS
-def test_w2_of_diagonal_gaussians_is_the_optimal_transport_of_pot(seed: int, n: int) -> None:
+def test_w2_of_diagonal_gaussians_agrees_with_the_optimal_transport_of_pot(seed: int, n: int) -> None:
     mean_i, mean_j, raw_i, raw_j = normal(4, n, seed=seed)
     std_i, std_j = raw_i.exp(), raw_j.exp()
     expected = ot.gaussian.bures_wasserstein_distance(mean_i, mean_j, th.diag(std_i**2), th.diag(std_j**2))
@@ -28,7 +32,7 @@ def test_w2_of_diagonal_gaussians_is_the_optimal_transport_of_pot(seed: int, n: 
     assert distance.item() == pytest.approx(float(expected), rel=1e-6, abs=1e-6)
 
 
-def test_w2_of_each_coordinate_is_that_of_one_dimensional_gaussians() -> None:
+def test_w2_of_each_coordinate_agrees_with_that_of_one_dimensional_gaussians() -> None:
     mean_i, mean_j, raw_i, raw_j = normal(4, 5)
     std_i, std_j = raw_i.exp(), raw_j.exp()
     expected = [
@@ -42,7 +46,7 @@ def test_w2_of_each_coordinate_is_that_of_one_dimensional_gaussians() -> None:
     assert losses.pairwise_distance(*means, "l1", *stds).item() == pytest.approx(sum(expected))
 
 
-def test_w2_of_equal_spreads_is_the_distance_of_the_means() -> None:
+def test_w2_of_gaussians_of_equal_spread_is_the_distance_of_the_means() -> None:
     mean_i, mean_j, std = normal(3, 4, 6)
     for distance in ("l1", "l2"):
         w2 = losses.pairwise_distance(mean_i, mean_j, distance, std.exp(), std.exp())
@@ -58,7 +62,7 @@ def test_huber_is_elementwise_and_the_norms_reduce_the_embedding() -> None:
 
 @given(seed=st.integers(0, 2**32 - 1), radius=st.floats(0.1, 100), scale=st.floats(0.01, 1000))
 @SETTINGS
-def test_projection_ends_in_the_ball_keeps_directions_and_leaves_the_interior_alone(
+def test_the_projection_ends_in_the_ball_and_keeps_directions_and_interior_points(
     seed: int, radius: float, scale: float
 ) -> None:
     x = (scale * normal(20, 7, seed=seed)).float()
@@ -71,7 +75,7 @@ def test_projection_ends_in_the_ball_keeps_directions_and_leaves_the_interior_al
     assert th.equal(losses.project_to_ball(x, None), x)
 
 
-def test_what_would_be_taken_for_something_else_is_refused() -> None:
+def test_names_and_radii_without_a_meaning_are_refused() -> None:
     x = th.ones(2, 3)
     with pytest.raises(ValueError, match=r"radius=-1\.0"):
         losses.project_to_ball(x, -1.0)
@@ -83,7 +87,29 @@ def test_what_would_be_taken_for_something_else_is_refused() -> None:
         DynamicsModel(3, 1, "gaussian", None)
 
 
-def test_what_was_outside_is_told_from_what_was_inside() -> None:
+@pytest.mark.parametrize("dynamics", DYNAMICS)
+def test_a_distance_works_everywhere_once_distances_holds_its_function(
+    dynamics: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The new distance is half of l2, so a result of any other function would have the wrong ratio to that of l2."""
+    monkeypatch.setitem(losses.DISTANCES, "half of l2", lambda *args: losses.l2(*args) / 2)
+    found = []
+    for distance in ("l2", "half of l2"):
+        folder = tmp_path / distance
+        # no reward and no bonus: the metric loss compares distances of embeddings alone
+        settings = dict(distance=distance, dynamics=dynamics, intrinsic_reward_scale=0.0, tensorboard_log=str(folder))
+        model = make_model(env=pendulum(reward=0.0), **settings)
+        model.learn(EPISODE, callback=ValueBoundCallback(n_states=20))  # no update yet, so both models embed alike
+        model.logger.close()
+        model.train(gradient_steps=1, batch_size=8)
+        logged = model.logger.name_to_value
+        assert th.isfinite(parameters(model.policy)).all()
+        bound = events(folder).Scalars("bisim/value_bound")[0].value
+        found.append([bound, logged["bisim/mu_bd"], logged["train/bisim_loss"]])
+    np.testing.assert_allclose(np.array(found[1]) / found[0], [0.5, 0.5, 0.25], rtol=1e-5)
+
+
+def test_on_surface_picks_exactly_the_vectors_that_were_outside() -> None:
     x = th.stack([scale * th.nn.functional.normalize(th.randn(50), dim=0) for scale in (1e-3, 0.99, 0.9999, 1.01, 2.0, 1e3)])
     norm = losses.project_to_ball(7.0 * x, 7.0).norm(dim=1)
     assert losses.on_surface(norm, 7.0).tolist() == [False, False, False, True, True, True]
@@ -105,7 +131,7 @@ def test_the_radius_follows_from_c_r_c_t_and_the_reward_range(
     assert losses.ball_radius(c_r, c_t, reward_range) == pytest.approx(radius)
 
 
-def test_dynamics_loss_is_the_gaussian_log_likelihood_and_leaves_its_target_alone() -> None:
+def test_the_dynamics_loss_is_the_gaussian_log_likelihood_and_sends_no_gradient_to_its_target() -> None:
     mean, raw = normal(2, 3, 5, 4)
     target = normal(5, 4, seed=2).requires_grad_()
     expected = -th.distributions.Normal(mean, raw.exp()).log_prob(target).mean() - 0.5 * np.log(2 * np.pi)
@@ -136,7 +162,7 @@ def test_a_gaussian_reward_is_judged_by_its_likelihood() -> None:
     assert losses.reward_loss(mean, None, rewards).item() == pytest.approx((mean - rewards).square().mean().item())
 
 
-def test_inverse_dynamics_loss_is_the_l1_distance_per_action_dimension() -> None:
+def test_the_inverse_dynamics_loss_is_the_l1_distance_per_action_dimension() -> None:
     predicted, actions = th.tensor([[0.5, -1.0], [0.0, 0.0]]), th.tensor([[0.0, 1.0], [0.0, 1.0]])
     assert losses.inverse_dynamics_loss(predicted, actions).item() == pytest.approx((2.5 / 2 + 1 / 2) / 2)
 

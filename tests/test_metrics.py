@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from small_models import make_model
 
 from sb3_robust_bisim import BisimSAC
 from sb3_robust_bisim.losses import DISTANCES, pairwise_distance
@@ -133,16 +134,15 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-def make_model(name: str, **kwargs: Any) -> Any:
+def model_of(name: str, **kwargs: Any) -> Any:
     settings = dict(VARIANTS[name])
     settings["metric_kwargs"] = {k: v for k, v in settings["metric_kwargs"].items() if k != "distance"}
-    small: dict[str, Any] = dict(learning_starts=20, batch_size=16, seed=0, policy_kwargs=dict(net_arch=[16]))
-    return BisimSAC("MlpPolicy", ENV, **{**small, **settings, **kwargs})
+    return make_model(env=ENV, **{"intrinsic_reward_scale": 0.0, "inverse_dynamics_coef": 0.0, **settings, **kwargs})
 
 
 @pytest.mark.parametrize("name", VARIANTS)
 def test_each_family_trains_saves_and_loads(name: str, tmp_path: Any) -> None:
-    model = make_model(name).learn(40)
+    model = model_of(name).learn(40)
     assert np.isfinite(model.logger.name_to_value["train/bisim_loss"])
     model.save(tmp_path / "model")
     loaded = BisimSAC.load(tmp_path / "model", env=model.get_env())
@@ -156,7 +156,7 @@ def test_each_family_trains_saves_and_loads(name: str, tmp_path: Any) -> None:
 
 
 def test_mico_takes_state_j_and_the_successors_from_the_target_encoder() -> None:
-    model = make_model("MICo")
+    model = model_of("MICo")
     z, target_z, target_next_z, next_z = normal(4, B, 50).float()
     rewards = th.zeros(B, 1)
     z.requires_grad_()
@@ -171,7 +171,7 @@ def test_mico_takes_state_j_and_the_successors_from_the_target_encoder() -> None
 
 
 def test_an_end_of_an_episode_is_an_absorbing_state_without_reward() -> None:
-    model = make_model("absorbing", c_t=0.5)
+    model = model_of("absorbing", c_t=0.5)
     z, next_z = normal(2, B, 50).float()
     rewards, dones = normal(B, 1, seed=1).float(), th.tensor([[0.0], [1.0]] * (B // 2))
     actions = th.zeros(B, 1)
@@ -195,7 +195,7 @@ def test_an_end_of_an_episode_is_an_absorbing_state_without_reward() -> None:
 
 
 def test_a_time_out_is_no_end() -> None:
-    model = make_model("absorbing").learn(210)  # an episode is truncated after 200 steps at the latest
+    model = model_of("absorbing").learn(210)  # an episode is truncated after 200 steps at the latest
     data = model.replay_buffer.sample(500)
     assert data.dones.sum() == 0 or data.dones.mean() < 1
 

@@ -6,9 +6,9 @@ off. `sb3_encoder` is SB3's SAC with the same encoder class, widths and batch. `
 in front of flat observations, NatureCNN in front of images. `sbx` is the SAC of sbx (JAX) as a user runs it, for flat
 observations. `floor` is the full method's matrix products and convolutions alone.
 
-BisimSAC and the floor are timed with the actor every 2nd update (`paper`) and every update (`sac`), in fp32 and in bf16. All
-arms are interleaved in one process, one thread; peak memory is that of a process per arm. sbx needs the extra `bench`;
-without it the arm is left out. The last line printed is one JSON object.
+BisimSAC and the floor are timed with the actor every 2nd update (`paper`) and every update (`sac`), in fp32 and, where the CPU
+has the instructions, in bf16. All arms are interleaved in one process, one thread; peak memory is that of a process per arm.
+sbx needs the extra `bench`; without it the arm is left out. The last line printed is one JSON object.
 """
 
 import argparse
@@ -41,6 +41,8 @@ from sb3_robust_bisim.encoders import MlpEncoder, PixelEncoder
 BATCH = {"mlp": 512, "cnn": 128}
 SCHEDULE = {"paper": dict(policy_delay=2, target_update_interval=2), "sac": dict(policy_delay=1)}
 FULL = dict(intrinsic_reward_scale=2.0, inverse_dynamics_coef=1.0)
+# bf16 without its instructions is emulated, and many times slower
+PRECISIONS = (False, True) if th.ops.mkldnn._is_mkldnn_bf16_supported() else (False,)
 CPU = dict(device="cpu", seed=0)  # as the floor
 OFF = dict(bisim_coef=0.0, norm_constraint=False)
 CARTPOLE = "robust_bisim/SparseCartPole-v0"
@@ -168,7 +170,7 @@ def build_arms(kind: str, per_round: int) -> dict[Arm, Callable[[], None]]:
         return repeat
 
     arms = {arm: trainer(arm) for arm in others(kind).values()}
-    for schedule, bf16 in itertools.product(SCHEDULE, (False, True)):
+    for schedule, bf16 in itertools.product(SCHEDULE, PRECISIONS):
         arms |= {(name, schedule, bf16): trainer((name, schedule, bf16)) for name in ("full", "off")}
         arms["floor", schedule, bf16] = repeated(floor(kind, schedule, bf16))
     return arms
@@ -192,7 +194,7 @@ def update_times(kind: str, rounds: int, per_round: int) -> dict[str, dict]:
     models = [arm for arm in times if arm[0] != "floor"]
     with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
         memory = dict(zip(models, pool.starmap(peak_memory, [(kind, *arm) for arm in models], 1), strict=True))
-    result: dict[str, dict] = {"others": {}, "fp32": {}, "bf16": {}}
+    result: dict[str, dict] = {"others": {}, "fp32": {}, **({"bf16": {}} if True in PRECISIONS else {})}
 
     def entry_of(arm: Arm) -> dict[str, float | list[float]]:
         entry: dict[str, float | list[float]] = {"ms": round(float(np.median(times[arm])), 3)}
@@ -201,7 +203,7 @@ def update_times(kind: str, rounds: int, per_round: int) -> dict[str, dict]:
 
     for name, arm in others(kind).items():
         result["others"][name] = entry_of(arm)
-    for schedule, bf16 in itertools.product(SCHEDULE, (False, True)):
+    for schedule, bf16 in itertools.product(SCHEDULE, PRECISIONS):
         entries: dict[str, dict] = {name: entry_of((name, schedule, bf16)) for name in ("full", "off", "floor")}
         # the ratio of each round, so that a slow spell of the machine strikes both sides
         beside = {**others(kind), "floor": ("floor", schedule, bf16)}

@@ -364,8 +364,8 @@ def test_without_opengl_tasks_from_state_work_and_those_from_pixels_say_what_to_
     ("wanted", "message"),
     [
         ("", "neither libEGL nor libOSMesa is installed"),
-        ("osmesa", "MUJOCO_GL=osmesa asks for the library libOSMesa, which is missing"),
-        ("disable", "MUJOCO_GL=disable switches drawing off"),
+        ("osmesa", "MUJOCO_GL=osmesa needs the library libOSMesa, which is missing"),
+        ("disable", "MUJOCO_GL=disable disables drawing"),
     ],
 )
 def test_the_reason_why_nothing_can_be_drawn_is_told(monkeypatch: pytest.MonkeyPatch, wanted: str, message: str) -> None:

@@ -77,6 +77,9 @@ _AS_WRITTEN = {
     f"{name}-max0.1": Method((name,), {"intrinsic_reward_max": 0.1}) for name in ("DBC-IR", "normed-IR", "normed-IR-ID")
 }
 _HALF = {"c_t": 0.5}
+_MICO = {"successors": "sample", "target_encoder": "both", "loss": "huber", "pairs": "all"}
+_SIMSR = {"successors": "sample", "target_encoder": "successors", "loss": "huber", "pairs": "all"}
+_RAP = {"loss": "variance_corrected"}
 
 FIGURES = {
     "cartpole": Figure(
@@ -99,6 +102,14 @@ FIGURES = {
             "normed-IR-no-metric": Method(("normed-IR", "no-metric"), seeds=5),
             "IR": Method(("DBC-IR", "no-metric"), seeds=5),  # no ball either
             "self-prediction-IR": Method(("self-prediction",), {"intrinsic_reward_scale": 2.0}, seeds=5),
+            # another metric in the place of the full method's, with the same weight
+            "full-MICo": Method(("normed-IR-ID",), {"distance": "mico", "metric_kwargs": _MICO}, seeds=5),
+            "full-SimSR": Method(
+                ("normed-IR-ID",), {"distance": "cosine", "norm_constraint": "sphere", "metric_kwargs": _SIMSR}, seeds=5
+            ),
+            "full-RAP": Method(
+                ("normed-IR-ID",), {"distance": "rap", "dynamics": "probabilistic", "metric_kwargs": _RAP}, seeds=5
+            ),
         },
         *(10, 10_000, 500, 10, 17),
         rows=ALL_ROWS,

@@ -6,7 +6,8 @@ no critic, no actor: the policy is fixed) on random finite MDPs, whose exact d_p
 distances of all pairs of states compare with it. The last line printed is one JSON object.
 
 deterministic: every state has one successor. stochastic: two to four. equal rewards: d_pi = 0, so the metric asks for
-collapse, and two actions lead to different states, so the inverse-dynamics head asks for the opposite.
+collapse, and two actions lead to different states, so the inverse-dynamics head asks for the opposite. terminating:
+deterministic, and a quarter of the states end the episode; the end counts as a state without reward.
 Observations are one-hot, or one-hot with as many numbers of fresh Gaussian noise of standard deviation 1 appended.
 Each arm and seed writes one file when it ends, and is not run again when it has one.
 """
@@ -34,12 +35,13 @@ from sb3_robust_bisim import BisimSAC
 from sb3_robust_bisim.losses import on_surface, pairwise_distance
 from sb3_robust_bisim.representation import Batch
 from sb3_robust_bisim.runs.atomic import atomic_path
-from sb3_robust_bisim.theory import FiniteMDP, policy_bisimulation_metric
+from sb3_robust_bisim.theory import FiniteMDP, mico_distance, policy_bisimulation_metric
 
 ROOT = Path(__file__).parent
 N_STATES, C_R, C_T = 16, 1.0, 0.8
 NOISE_MULTIPLIER = 1
 BATCH_SIZE = 128
+MICO = {"successors": "sample", "target_encoder": "both", "loss": "huber", "pairs": "all"}
 ACTIONS = np.array([[-1.0], [1.0]], dtype=np.float32)
 
 
@@ -48,13 +50,15 @@ class Arm:
     """
     One thing to be trained.
 
-    :param mdp: "deterministic", "stochastic" or "equal rewards"
+    :param mdp: "deterministic", "stochastic", "terminating" or "equal rewards"
     :param noise: whether noise is appended to the observations
     :param distance: as BisimSAC's
     :param ball: as BisimSAC's ``norm_constraint``
     :param dynamics: as BisimSAC's
     :param inverse_dynamics_coef: as BisimSAC's
     :param reward_max: rewards lie in [0, reward_max], which sets the radius of the ball too
+    :param nll_beta: as BisimSAC's
+    :param absorbing: as Metric's
     """
 
     mdp: str
@@ -64,6 +68,13 @@ class Arm:
     dynamics: str = "deterministic"
     inverse_dynamics_coef: float = 0.0
     reward_max: float = 4.0
+    nll_beta: float = 0.0
+    absorbing: bool = False
+
+    @property
+    def metric_kwargs(self) -> dict:
+        """MICo takes its successors from the samples, as the paper does; here there is no target encoder."""
+        return {"absorbing": self.absorbing, **(MICO if self.distance == "mico" else {})}
 
     @property
     def wasserstein_order(self) -> float:
@@ -76,6 +87,8 @@ class Arm:
         observations = "noise-padded" if self.noise else "one-hot"
         parts = [self.mdp, observations, self.distance, "ball" if self.ball else "no ball"]
         parts += [self.dynamics] if self.dynamics != "deterministic" else []
+        parts += [f"beta {self.nll_beta}"] if self.nll_beta else []
+        parts += ["absorbing"] if self.absorbing else []
         parts += ["rewards in [0, 1]"] if self.reward_max == 1 else []
         if self.mdp == "equal rewards":
             parts.append("inverse dynamics" if self.inverse_dynamics_coef else "no inverse dynamics")
@@ -100,8 +113,11 @@ def arms() -> list[Arm]:
         *(Arm("stochastic", False, distance, True) for distance in ("l1", "l2")),
         *(Arm("stochastic", noise, "l2", True, "probabilistic") for noise in (False, True)),
     ]
+    gaussian = [Arm("stochastic", False, "l2", True, "probabilistic", nll_beta=beta) for beta in (0.5, 1.0)]
+    ends = [Arm("terminating", False, "l2", True, absorbing=absorbing) for absorbing in (False, True)]
+    mico = [Arm("stochastic", False, "mico", False)]
     collapse = [Arm("equal rewards", False, "l2", True, inverse_dynamics_coef=coef) for coef in (0.0, 1.0)]
-    return deterministic + stochastic + collapse
+    return deterministic + stochastic + gaussian + ends + mico + collapse
 
 
 def random_mdp(kind: str, reward_max: float, rng: np.random.Generator) -> tuple[FiniteMDP, np.ndarray]:
@@ -116,7 +132,12 @@ def random_mdp(kind: str, reward_max: float, rng: np.random.Generator) -> tuple[
             transition[state][:, successors] = rng.dirichlet(np.ones(len(successors)))
         else:
             transition[state, [0, 1], rng.choice(N_STATES, 2, replace=False)] = 1.0
+    if kind == "terminating":
+        transition[-1] = np.eye(N_STATES)[-1]  # the end, which several states lead to
+        transition[: N_STATES // 4, 1] = np.eye(N_STATES)[-1]
     rewards = reward_max * (np.full(N_STATES, 0.5) if kind == "equal rewards" else rng.random(N_STATES))
+    if kind == "terminating":
+        rewards[-1] = 0.0
     policy = [0.5, 0.5] if kind == "equal rewards" else [0.0, 1.0]
     return FiniteMDP(transition, np.tile(rewards[:, None], 2)), np.tile(policy, (N_STATES, 1))
 
@@ -175,6 +196,8 @@ def build(arm: Arm, observe: Observations, seed: int) -> BisimSAC:
         norm_constraint=arm.ball,
         distance=arm.distance,
         dynamics=arm.dynamics,
+        nll_beta=arm.nll_beta,
+        metric_kwargs=arm.metric_kwargs,
         inverse_dynamics_coef=arm.inverse_dynamics_coef,
     )
 
@@ -182,7 +205,8 @@ def build(arm: Arm, observe: Observations, seed: int) -> BisimSAC:
 def train(arm: Arm, seed: int, steps: int, path: Path) -> dict:
     """Train one arm and compare, or read its file if there is one of the same settings."""
     key = {"arm": asdict(arm), "seed": seed, "steps": steps, "c_r": C_R, "c_t": C_T, "n_states": N_STATES}
-    if path.exists() and (finished := json.loads(path.read_text())).items() >= key.items():
+    finished = json.loads(path.read_text()) if path.exists() else {"arm": {}}
+    if finished["arm"] and finished.items() >= {**key, "arm": finished["arm"]}.items() and Arm(**finished["arm"]) == arm:
         return finished
     rng, started = np.random.default_rng(seed), time.process_time()
     mdp, policy = random_mdp(arm.mdp, arm.reward_max, rng)
@@ -193,13 +217,16 @@ def train(arm: Arm, seed: int, steps: int, path: Path) -> dict:
     at_start, _ = learned_distances(model, observe)
     cumulative = mdp.transition.cumsum(axis=-1)
     for _ in range(steps):
-        states = rng.integers(N_STATES, size=BATCH_SIZE)
+        # an agent never acts in a terminal state
+        states = rng.integers(N_STATES - (arm.mdp == "terminating"), size=BATCH_SIZE)
         actions = (rng.random(BATCH_SIZE) > policy[states, 0]).astype(int)
         next_states = (cumulative[states, actions] < rng.random((BATCH_SIZE, 1))).sum(axis=1).clip(max=N_STATES - 1)
         rewards = th.as_tensor(mdp.reward[states, actions][:, None], dtype=th.float32)
         encode = model.critic.features_extractor.encode
         z, next_z = encode(observe(states)), encode(observe(next_states))
-        batch = Batch(z, th.as_tensor(ACTIONS[actions]), rewards, th.zeros_like(rewards), next_z, next_z.detach())
+        ends = (next_states == N_STATES - 1) & (arm.mdp == "terminating")
+        dones = th.as_tensor(ends[:, None], dtype=th.float32)
+        batch = Batch(z, th.as_tensor(ACTIONS[actions]), rewards, dones, next_z, next_z.detach(), z.detach())
         loss, terms = model.policy.representation.losses(batch)
         for optimizer in optimizers:
             optimizer.zero_grad()
@@ -208,7 +235,10 @@ def train(arm: Arm, seed: int, steps: int, path: Path) -> dict:
             optimizer.step()
         schedule.step()
     learned, embeddings = learned_distances(model, observe)
-    exact = policy_bisimulation_metric(mdp, policy, C_R, C_T, p=arm.wasserstein_order)
+    if arm.distance == "mico":
+        exact = mico_distance(mdp, policy, C_R, C_T)
+    else:
+        exact = policy_bisimulation_metric(mdp, policy, C_R, C_T, p=arm.wasserstein_order)
     norms = np.linalg.norm(embeddings, axis=-1)
     run = {
         **key,
@@ -258,8 +288,8 @@ def huberised(mdp: FiniteMDP) -> np.ndarray:
 def plot(runs: list[dict], path: Path) -> None:
     """Learned against exact distances, one panel per arm but for the collapse."""
     shown = [arm for arm in arms() if arm.mdp != "equal rewards"]
-    figure = Figure(figsize=(16, 12.5), layout="constrained")
-    for axes, arm in zip(figure.subplots(4, 5).flat, shown, strict=False):
+    figure = Figure(figsize=(16, 15.5), layout="constrained")
+    for axes, arm in zip(figure.subplots(5, 5).flat, shown, strict=False):
         pairs = np.triu_indices(N_STATES, 1)
         largest = 0.0
         for run in (run for run in runs if run["arm"] == asdict(arm)):
@@ -302,10 +332,12 @@ def main() -> None:
     parser.add_argument(
         "--steps", type=int, default=4000, help="gradient steps, twice as many with noise (default: %(default)s)"
     )
+    parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT", help="arms whose name holds one of these texts")
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "metric_exactness")
     args = parser.parse_args()
     th.set_num_threads(1)
-    todo = [(arm, seed) for seed in args.seeds for arm in arms()]
+    wanted = [arm for arm in arms() if any(text in arm.name for text in args.only)]
+    todo = [(arm, seed) for seed in args.seeds for arm in wanted]
     runs = []
     for arm, seed in tqdm(todo, unit="arm", file=sys.stderr):
         name = arm.name.replace(", ", "_").replace(" ", "-").replace("[0_1]", "0-1")

@@ -1,38 +1,30 @@
 import inspect
-import io
-import pathlib
 from dataclasses import fields
-from typing import Any, ClassVar, TypeVar
+from typing import Any, Self
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import check_for_correct_spaces, polyak_update
 from stable_baselines3.sac.sac import SAC
 from torch.nn import functional as F
 
 from sb3_robust_bisim.checks import check_arguments, check_names
+from sb3_robust_bisim.heads import BisimActor, BisimCritic
 from sb3_robust_bisim.intrinsic_reward import bound, with_intrinsic_reward
-from sb3_robust_bisim.policies import BisimActor, BisimCritic, BisimPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
-from sb3_robust_bisim.representation import Objective
-from sb3_robust_bisim.runs.atomic import atomic_save
+from sb3_robust_bisim.objective import Objective
+from sb3_robust_bisim.policies import POLICIES, BisimPolicy
+from sb3_robust_bisim.runs.atomic import PathOrStream, atomic_save
 from sb3_robust_bisim.update_log import UpdateLog, unchecked_distributions
-
-SelfBisimSAC = TypeVar("SelfBisimSAC", bound="BisimSAC")
-PathOrStream = str | pathlib.Path | io.BufferedIOBase
 
 
 class BisimSAC(SAC):
     """
-    Soft Actor-Critic whose encoder is shaped by a robust on-policy bisimulation metric.
-
-    Paper: Towards Robust Bisimulation Metric Learning (Kemertas and Aumentado-Armstrong, NeurIPS 2021).
+    Soft Actor-Critic whose encoder is shaped by a robust on-policy bisimulation metric (Kemertas and Aumentado-Armstrong,
+    Towards Robust Bisimulation Metric Learning, NeurIPS 2021).
 
     One encoder z = phi(s), owned by the critic, is trained by critic, metric, dynamics, reward and inverse-dynamics loss in
-    one backward pass, and never by the actor loss. The paper's methods are settings: SAC ``bisim_coef=0,
-    norm_constraint=False``; DBC ``norm_constraint=False``; normed DBC the default; normed-IR adds ``intrinsic_reward_scale``,
-    normed-ID ``inverse_dynamics_coef``.
+    one backward pass, and never by the actor loss. zoo_configs/bisim_sac.yml names the settings of each method.
 
     :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a subclass of ``BisimPolicy``
     :param env: the environment, or its id
@@ -42,18 +34,23 @@ class BisimSAC(SAC):
     :param reward_range: (R_min, R_max) of one agent step: action repeat sums rewards. It sets the radius of the norm
         constraint. The bonus is not counted, and the paper takes (0, 1) for all its tasks
     :param norm_constraint: hold embeddings and predictions in the L2 ball of eq:constraint, with radius
-        c_R (R_max - R_min) / (2 (1 - c_T)). Between points of it only ``distance="l2"`` is at most the metric's diameter
-    :param distance: "huber" (elementwise, the paper's experiments), "l1" or "l2" (norms of the whole embedding);
-        see :func:`sb3_robust_bisim.losses.pairwise_distance`
+        c_R (R_max - R_min) / (2 (1 - c_T)). Between points of it only ``distance="l2"`` is at most the metric's diameter.
+        "sphere": scale embeddings to length 1 (SimSR)
+    :param distance: "huber" (elementwise, the paper's), "l1", "l2", "mico", "cosine" or "rap"; :mod:`sb3_robust_bisim.losses`
+    :param metric_kwargs: other settings of the metric, such as ``dict(successors="sample", pairs="all")``; see
+        :class:`sb3_robust_bisim.metrics.Metric`
     :param dynamics: "deterministic", "probabilistic" (Gaussian) or "ensemble" (5 Gaussians)
+    :param nll_beta: in [0, 1]; above 0 Gaussian dynamics learn by beta-NLL, see :func:`sb3_robust_bisim.losses.dynamics_loss`
     :param model_coef: weight of dynamics and reward loss, >= 0. None: 1 where a model is needed, that is with
         ``bisim_coef`` or ``intrinsic_reward_scale`` above 0, else 0
+    :param reward_coef: weight of the reward loss where it differs from ``model_coef``, >= 0
     :param intrinsic_reward_scale: eta_r >= 0; 0 gives no bonus
     :param intrinsic_reward_max: R_max_I >= 0, the largest bonus, in units of reward
     :param inverse_dynamics_coef: eta_d >= 0, weight of the inverse-dynamics loss; 0 turns it off
     :param policy_delay: gradient steps from one update of actor and entropy coefficient to the next. The target nets follow
         SAC's ``target_update_interval``
     :param initial_gradient_steps: gradient steps done at once when learning starts (1000 in the published experiments)
+    :param random_shift: shift the images of each batch by up to this many pixels (DrQ), s and s' apart; 0 turns it off
     :param bf16: run the encoder under bfloat16 autocast: faster from pixels on a GPU, or a CPU that has it (see
         docs/performance.md). Heads, models and losses stay in fp32
     :param kwargs: the arguments of :class:`stable_baselines3.SAC`; ``n_steps`` must stay 1
@@ -68,11 +65,7 @@ class BisimSAC(SAC):
         model.learn(10_000, progress_bar=True)
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": MlpPolicy,
-        "CnnPolicy": CnnPolicy,
-        "MultiInputPolicy": MultiInputPolicy,
-    }
+    policy_aliases = POLICIES
     policy: BisimPolicy
     actor: BisimActor
     critic: BisimCritic
@@ -87,15 +80,19 @@ class BisimSAC(SAC):
         c_r: float = 1.0,
         c_t: float | None = None,
         reward_range: tuple[float, float] = (0.0, 1.0),
-        norm_constraint: bool = True,
+        norm_constraint: bool | str = True,
         distance: str = "huber",
+        metric_kwargs: dict[str, Any] | None = None,
         dynamics: str = "deterministic",
+        nll_beta: float = 0.0,
         model_coef: float | None = None,
+        reward_coef: float | None = None,
         intrinsic_reward_scale: float = 0.0,
         intrinsic_reward_max: float = 0.1,
         inverse_dynamics_coef: float = 0.0,
         policy_delay: int = 2,
         initial_gradient_steps: int = 0,
+        random_shift: int = 0,
         bf16: bool = False,
         _init_setup_model: bool = True,
         **kwargs: Any,
@@ -110,13 +107,17 @@ class BisimSAC(SAC):
         self.reward_range = reward_range
         self.norm_constraint = norm_constraint
         self.distance = distance
+        self.metric_kwargs = metric_kwargs
         self.dynamics = dynamics
+        self.nll_beta = nll_beta
         self.model_coef = model_coef
+        self.reward_coef = reward_coef
         self.intrinsic_reward_scale = intrinsic_reward_scale
         self.intrinsic_reward_max = intrinsic_reward_max
         self.inverse_dynamics_coef = inverse_dynamics_coef
         self.policy_delay = policy_delay
         self.initial_gradient_steps = initial_gradient_steps
+        self.random_shift = random_shift
         self.bf16 = bf16
 
         if _init_setup_model:
@@ -130,10 +131,9 @@ class BisimSAC(SAC):
         check_arguments(self)
         if self.env is not None:
             self.env = with_intrinsic_reward(self.env, self.observation_space, self.intrinsic_reward_scale)
-        # The policy learns of our own arguments here and not in __init__, so that `load(..., c_t=0.5)` reaches it, and
-        # the user's dict is saved as it was given
+        # here and not in __init__: `load(..., c_t=0.5)` reaches the policy, and the user's dict is saved as it was given
         policy_kwargs = self.policy_kwargs
-        self.policy_kwargs = {**policy_kwargs, "objective": objective, "bf16": self.bf16}
+        self.policy_kwargs = {**policy_kwargs, "objective": objective, "bf16": self.bf16, "random_shift": self.random_shift}
         super()._setup_model()
         self.policy_kwargs = policy_kwargs
 
@@ -254,15 +254,11 @@ class BisimSAC(SAC):
             log.add(self._n_updates, representation.statistics(batch.z.detach()))
             log.record(self.logger)
 
-    @th.no_grad()
     def _intrinsic_reward(self, obs: Any, actions: np.ndarray, next_obs: Any) -> np.ndarray:
-        """The bonus, (n_envs,), of transitions as the environment sees them: not normalised, actions in its own scale."""
+        """The bonus, (n_envs,), of transitions as the environment sees them: not normalised."""
         if self._vec_normalize_env is not None:
             obs, next_obs = self._vec_normalize_env.normalize_obs(obs), self._vec_normalize_env.normalize_obs(next_obs)
-        encode = self.critic.features_extractor.encode
-        z, next_z = (encode(self.policy.obs_to_tensor(o)[0]) for o in (obs, next_obs))
-        scaled_actions = th.as_tensor(self.policy.scale_action(actions), dtype=th.float32, device=self.device).flatten(1)
-        bonus = self.policy.representation.bonus(z, scaled_actions, next_z).cpu().numpy()
+        bonus = self.policy.bonus(obs, actions, next_obs)
         self.logger.record_mean("rollout/intrinsic_reward", bonus.mean(dtype=np.float64))
         return bonus
 
@@ -272,20 +268,20 @@ class BisimSAC(SAC):
         super().set_env(with_intrinsic_reward(env, self.observation_space, self.intrinsic_reward_scale), force_reset)
 
     @classmethod
-    def load(cls: type[SelfBisimSAC], path: PathOrStream, *args: Any, **kwargs: Any) -> SelfBisimSAC:
+    def load(cls, path: PathOrStream, *args: Any, **kwargs: Any) -> Self:
         """Like SB3's ``load``; arguments of BisimSAC replace what the model was saved with, and must exist."""
         check_names(cls, kwargs, inspect.signature(SAC.load).parameters)
         return super().load(path, *args, **kwargs)
 
     def learn(
-        self: SelfBisimSAC,
+        self,
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int = 4,
         tb_log_name: str = "BisimSAC",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
-    ) -> SelfBisimSAC:
+    ) -> Self:
         with bound(self.env, self._intrinsic_reward if self.intrinsic_reward_scale > 0 else None):
             return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 

@@ -2,10 +2,12 @@
 
 import difflib
 import inspect
+import warnings
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import NStepReplayBuffer
@@ -25,6 +27,9 @@ def check_arguments(model: Any) -> None:
         value = getattr(model, name)
         _require(isinstance(value, (int, np.integer)) and value >= least, model, name, f"an integer >= {least}")
 
+    if model.bf16 and model.device.type == "cpu" and not th.ops.mkldnn._is_mkldnn_bf16_supported():
+        warnings.warn("bf16=True: this CPU has no bfloat16 instructions, so fp32 is several times faster.", stacklevel=4)
+    _check_random_shift(model.random_shift, model.observation_space)
     n_steps = model.n_steps if model.n_steps != 1 else model.replay_buffer_kwargs.get("n_steps", 1)
     buffer_class = model.replay_buffer_class
     if n_steps != 1 or (buffer_class is not None and issubclass(buffer_class, NStepReplayBuffer)):
@@ -37,13 +42,22 @@ def check_arguments(model: Any) -> None:
             f"intrinsic_reward_scale={model.intrinsic_reward_scale} with HerReplayBuffer: relabelled transitions get the "
             "environment's reward, without the bonus. Set intrinsic_reward_scale=0."
         )
-    for name in sorted({"objective", "bf16"} & set(model.policy_kwargs)):
+    for name in sorted({"objective", "bf16", "random_shift"} & set(model.policy_kwargs)):
         remedy = "pass its settings to BisimSAC" if name == "objective" else f"pass {name} to BisimSAC"
         raise ValueError(f"policy_kwargs with {name}={model.policy_kwargs[name]!r}: BisimSAC sets it; {remedy}.")
     if not (isinstance(model.policy_class, type) and issubclass(model.policy_class, BisimPolicy)):
         raise ValueError(f"policy={model.policy_class!r}: it must be a subclass of sb3_robust_bisim.policies.BisimPolicy.")
     if "features_extractor_class" not in model.policy_kwargs:
         _check_policy_fits(model)
+
+
+def _check_random_shift(pad: Any, space: spaces.Space) -> None:
+    if not isinstance(pad, (int, np.integer)) or isinstance(pad, bool) or pad < 0:
+        raise ValueError(f"random_shift={pad!r}: it must be an integer in [0, image size), 0 for none.")
+    if pad > 0 and not is_image_space(space):
+        raise ValueError(f"random_shift={pad} with observations {space}: it needs images of bytes. Set random_shift=0.")
+    if pad > 0 and pad >= (size := sorted(space.shape or ())[1]):  # the smallest axis is the channels
+        raise ValueError(f"random_shift={pad}: it must be an integer in [0, {size - 1}] for images {space.shape}.")
 
 
 def _check_policy_fits(model: Any) -> None:

@@ -8,6 +8,7 @@ from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_ima
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
+from torch.nn import functional as F
 
 from sb3_robust_bisim.losses import project_to_ball
 
@@ -19,6 +20,7 @@ class Encoder(BaseFeaturesExtractor):
     :param extractor: gives the features, (B, n)
     :param observation_space: what it reads
     :param radius: of the ball that holds the embeddings, None for no constraint
+    :param sphere: scale all embeddings to length 1 instead
     :param bf16: run the extractor under bfloat16 autocast
     :param normalize_images: whether images are to be divided by 255
     """
@@ -28,12 +30,14 @@ class Encoder(BaseFeaturesExtractor):
         extractor: BaseFeaturesExtractor,
         observation_space: spaces.Space,
         radius: float | None,
+        sphere: bool,
         bf16: bool,
         normalize_images: bool,
     ) -> None:
         super().__init__(observation_space, extractor.features_dim)
         self.extractor = extractor
         self.radius = radius
+        self.sphere = sphere
         self.bf16 = bf16
         self.normalize_images = normalize_images
 
@@ -53,7 +57,8 @@ class Encoder(BaseFeaturesExtractor):
         device = next(iter(preprocessed.values())).device if isinstance(preprocessed, dict) else preprocessed.device
         with th.autocast(device.type, th.bfloat16) if self.bf16 else nullcontext():
             features = self.extractor(preprocessed)
-        return project_to_ball(features.float(), self.radius)
+        features = features.float()
+        return F.normalize(features, dim=-1) if self.sphere else project_to_ball(features, self.radius)
 
 
 class Encoded(dict[Encoder, th.Tensor]):

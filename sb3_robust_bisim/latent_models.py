@@ -12,6 +12,7 @@ from sb3_robust_bisim.losses import project_to_ball
 DYNAMICS = ("deterministic", "probabilistic", "ensemble")
 ENSEMBLE_SIZE = 5
 STD_MIN, STD_MAX = 1e-4, 10.0
+REWARD_STD_MAX = 1.0
 # In place: one pass over memory and one allocation less for each layer, and the same numbers
 RELU: Any = partial(nn.ReLU, inplace=True)
 ELU: Any = partial(nn.ELU, inplace=True)
@@ -84,9 +85,29 @@ class DynamicsModel(nn.Module):
         return project_to_ball(mean + prediction.std[member] * th.randn_like(mean), self.radius)
 
 
-def reward_model(features_dim: int, hidden_dim: int = 512) -> nn.Module:
-    """r(z'): (B, n) -> (B, 1); one hidden layer, 512 wide by default, with LayerNorm and ReLU."""
-    return nn.Sequential(*create_mlp(features_dim, 1, [hidden_dim], RELU, post_linear_modules=[nn.LayerNorm]))
+class RewardModel(nn.Module):
+    """
+    r(z') with one hidden layer, LayerNorm and ReLU: a number, or a Gaussian with standard deviation in [1e-4, 1].
+
+    :param features_dim: width n of the embedding
+    :param probabilistic: whether the standard deviation is predicted too
+    :param hidden_dim: width of the hidden layer
+    """
+
+    def __init__(self, features_dim: int, probabilistic: bool = False, hidden_dim: int = 512) -> None:
+        super().__init__()
+        self.probabilistic = probabilistic
+        output_dim = 2 if probabilistic else 1
+        layers = create_mlp(features_dim, output_dim, [hidden_dim], RELU, post_linear_modules=[nn.LayerNorm])
+        self.net = nn.Sequential(*layers)
+
+    def forward(self, next_z: th.Tensor) -> tuple[th.Tensor, th.Tensor | None]:
+        """(B, n) -> (B, 1), and (B, 1) or None"""
+        output = self.net(next_z)
+        if not self.probabilistic:
+            return output, None
+        mean, raw_std = output.chunk(2, dim=-1)
+        return mean, STD_MIN + (REWARD_STD_MAX - STD_MIN) * raw_std.sigmoid()
 
 
 class InverseDynamicsModel(nn.Module):

@@ -65,6 +65,7 @@ def huber(x: th.Tensor, y: th.Tensor, x_std: th.Tensor | None = None, y_std: th.
     their coordinates apart too: each coordinate has its own W2, sqrt(dmu^2 + dsigma^2).
     """
     if x_std is None or y_std is None:
+        x, y = th.broadcast_tensors(x, y)  # rewards of all pairs
         return F.smooth_l1_loss(x, y, reduction="none")
     return _squared_w2(x, y, x_std, y_std).sqrt()
 
@@ -88,8 +89,42 @@ def _squared_w2(x: th.Tensor, y: th.Tensor, x_std: th.Tensor, y_std: th.Tensor) 
     return (x - y).square() + (x_std - y_std).square()
 
 
+def mico(x: th.Tensor, y: th.Tensor, x_std: th.Tensor | None = None, y_std: th.Tensor | None = None) -> th.Tensor:
+    """MICo's diffuse metric, (|x|^2 + |y|^2) / 2 + 0.1 theta(x, y), theta the angle. U(x, x) > 0. Spreads are ignored."""
+    return _norms_and_angle(x, y, 0.5, 0.1)
+
+
+def rap(x: th.Tensor, y: th.Tensor, x_std: th.Tensor | None = None, y_std: th.Tensor | None = None) -> th.Tensor:
+    """RAP's |x|^2 + |y|^2 + 1e-6 theta(x, y), theta the angle. Spreads are ignored."""
+    return _norms_and_angle(x, y, 1.0, 1e-6)
+
+
+def cosine(x: th.Tensor, y: th.Tensor, x_std: th.Tensor | None = None, y_std: th.Tensor | None = None) -> th.Tensor:
+    """SimSR's 1 - x . y, meant for the unit sphere. Spreads are ignored."""
+    return 1 - _dot(x, y)
+
+
+def _norms_and_angle(x: th.Tensor, y: th.Tensor, norms: float, angle: float) -> th.Tensor:
+    x_squared, y_squared = x.square().sum(dim=-1, keepdim=True), y.square().sum(dim=-1, keepdim=True)
+    cosine = _dot(x, y) / (x_squared * y_squared).clamp(min=1e-12).sqrt()
+    # sqrt has no finite gradient at 0: parallel vectors get none
+    squared_sine = 1 - cosine.square()
+    sine = th.where(squared_sine > 1e-6, squared_sine, 1.0).sqrt() * (squared_sine > 1e-6)
+    return norms * (x_squared + y_squared) + angle * th.atan2(sine, cosine)
+
+
+def _dot(x: th.Tensor, y: th.Tensor) -> th.Tensor:
+    """Inner products of matching rows; for (B, 1, n) and (1, B, n) those of all pairs, as one matrix product."""
+    if x.dim() == 3:
+        return (x[:, 0] @ y[0].T)[..., None]
+    return (x * y).sum(dim=-1, keepdim=True)
+
+
 # What `distance` may name. A new distance is one function of the same signature and one entry here
-DISTANCES: dict[str, Callable[..., th.Tensor]] = {"huber": huber, "l1": l1, "l2": l2}
+DISTANCES: dict[str, Callable[..., th.Tensor]] = {
+    **{"huber": huber, "l1": l1, "l2": l2},
+    **{"mico": mico, "cosine": cosine, "rap": rap},
+}
 
 
 def pairwise_distance(
@@ -98,11 +133,11 @@ def pairwise_distance(
     """
     Distance between matching rows of two batches: of points, or of the diagonal Gaussians around them.
 
-    :param x: (B, n)
+    :param x: (B, n); or (B, 1, n) where ``y`` is (1, B, n), for all pairs
     :param y: (B, n)
     :param distance: a key of ``DISTANCES``
     :param x_std: (B, n) standard deviations, None for points; likewise ``y_std``
-    :return: (B, n) for "huber", which is elementwise, else (B, 1)
+    :return: (B, n) for "huber", which is elementwise, else (B, 1); (B, B, 1) for all pairs
     :raises ValueError: for another distance
     """
     if distance not in DISTANCES:
@@ -110,49 +145,34 @@ def pairwise_distance(
     return DISTANCES[distance](x, y, x_std, y_std)
 
 
-def bisim_loss(
-    z: th.Tensor,
-    rewards: th.Tensor,
-    mean: th.Tensor,
-    std: th.Tensor | None,
-    pairs: th.Tensor,
-    c_r: float,
-    c_t: float,
-    distance: str,
-) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-    """
-    Metric loss, eq:general-bisim-loss: mean over pairs of (d(z_i, z_j) - c_R |r_i - r_j| - c_T W(P_i, P_j))^2.
-    The target, reward gap plus transition term, carries no gradient.
-
-    With "huber" the reward gap is the Huber distance too, a (B, 1) column broadcast over the n coordinates.
-
-    :param z: (B, n) embeddings, the only input that receives gradient
-    :param rewards: (B, 1)
-    :param mean: (B, n) predicted next embeddings
-    :param std: (B, n), or None for point masses, where W is the distance between the means
-    :param pairs: (B,) row j that is paired with row i
-    :return: the loss and, for diagnosis and without gradient, the mean distances mu_bd and mu_rd (eq:reward-dependence2)
-    """
-    z_distance = pairwise_distance(z, z[pairs], distance)
-    with th.no_grad():
-        reward_distance = pairwise_distance(rewards, rewards[pairs], distance)
-        paired_std = None if std is None else std[pairs]
-        target = c_r * reward_distance + c_t * pairwise_distance(mean, mean[pairs], distance, std, paired_std)
-    return F.mse_loss(z_distance, target), z_distance.detach().mean(), reward_distance.mean()
-
-
-def dynamics_loss(mean: th.Tensor, std: th.Tensor | None, target: th.Tensor) -> th.Tensor:
+def dynamics_loss(mean: th.Tensor, std: th.Tensor | None, target: th.Tensor, beta: float = 0.0) -> th.Tensor:
     """
     Negative log-likelihood of the true next embedding, up to a constant, averaged over batch, coordinates and models.
+
+    The likelihood of a Gaussian excuses means that are wrong by a large sigma, and then hardly corrects them. beta-NLL
+    (Seitzer et al., 2022) weights each coordinate by sigma^(2 beta), without gradient.
 
     :param mean: (K, B, n)
     :param std: (K, B, n), or None for sigma = 1
     :param target: (B, n) next embeddings; no gradient flows into them
+    :param beta: in [0, 1]; 0 is the likelihood, 1 corrects the means as the squared error does
     """
     error = mean - target.detach()
     if std is None:
         return 0.5 * error.square().mean()
-    return (0.5 * (error / std).square() + std.log()).mean()
+    likelihood = 0.5 * (error / std).square() + std.log()
+    return (likelihood * std.detach() ** (2 * beta)).mean() if beta else likelihood.mean()
+
+
+def reward_loss(mean: th.Tensor, std: th.Tensor | None, rewards: th.Tensor) -> th.Tensor:
+    """
+    Squared error, or the negative log-likelihood of a Gaussian up to a constant; mean over the batch.
+
+    :param mean: (B, 1)
+    :param std: (B, 1), or None for the squared error
+    :param rewards: (B, 1)
+    """
+    return F.mse_loss(mean, rewards) if std is None else (0.5 * ((mean - rewards) / std).square() + std.log()).mean()
 
 
 def inverse_dynamics_loss(predicted_actions: th.Tensor, actions: th.Tensor) -> th.Tensor:

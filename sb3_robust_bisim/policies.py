@@ -3,61 +3,24 @@
 from functools import partial
 from typing import Any, ClassVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.type_aliases import PyTorchObs, ReplayBufferSamples, Schedule
-from stable_baselines3.sac.policies import Actor, SACPolicy
+from stable_baselines3.common.type_aliases import ReplayBufferSamples, Schedule
+from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
+from sb3_robust_bisim.augmentation import random_shift
 from sb3_robust_bisim.encoders import CombinedEncoder, Encoded, Encoder, MlpEncoder, PixelEncoder
+from sb3_robust_bisim.heads import BisimActor, BisimCritic
 from sb3_robust_bisim.latent_models import RELU
-from sb3_robust_bisim.representation import Batch, Objective, Representation
+from sb3_robust_bisim.objective import Objective
+from sb3_robust_bisim.representation import Batch, Representation
 
-# Bounds of the actor's log standard deviation, reached smoothly through a tanh
-LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
 INVERSE_DYNAMICS_ADAM = dict(lr=1e-4, weight_decay=1e-5)
-
-
-class BisimActor(Actor):
-    """
-    SAC's actor, which takes observations that have been encoded as well.
-
-    :param detach_features: whether the encoder belongs to the critic, so that no gradient may reach it from here
-    """
-
-    features_extractor: Encoder
-
-    def __init__(self, *args: Any, detach_features: bool = True, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.detach_features = detach_features
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "detach_features": self.detach_features}
-
-    def extract_features(self, obs: PyTorchObs | Encoded, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
-        with th.set_grad_enabled(th.is_grad_enabled() and not self.detach_features):
-            features = self.features_extractor.encode(obs)
-        return features.detach() if self.detach_features else features
-
-    def get_action_dist_params(self, obs: PyTorchObs | Encoded) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
-        latent_pi = self.latent_pi(self.extract_features(obs, self.features_extractor))
-        mean_actions = self.mu(latent_pi)
-        if self.use_sde:
-            return mean_actions, self.log_std, dict(latent_sde=latent_pi)
-        log_std = th.tanh(self.log_std(latent_pi))  # type: ignore[operator]
-        return mean_actions, LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (log_std + 1), {}
-
-
-class BisimCritic(ContinuousCritic):
-    """SAC's critic, owner of the encoder, which takes observations that have been encoded as well."""
-
-    features_extractor: Encoder
-
-    def extract_features(self, obs: PyTorchObs | Encoded, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
-        return self.features_extractor.encode(obs)
 
 
 class BisimPolicy(SACPolicy):
@@ -68,7 +31,7 @@ class BisimPolicy(SACPolicy):
     all. The inverse-dynamics model has a slower one.
 
     :param objective: what shapes the embedding beside the critic. Set by BisimSAC
-    :param bf16: run the encoder under bfloat16 autocast. Set by BisimSAC
+    :param bf16: run the encoder under bfloat16 autocast. Set by BisimSAC, likewise ``random_shift``
     :param share_features_extractor: True: the actor reads the critic's encoder and never trains it. False: it has one
         of its own, trained by the actor loss as in SB3's SAC; the metric then shapes the critic's alone
     :param inverse_dynamics_optimizer_kwargs: Adam's arguments for the inverse-dynamics model, which follows no schedule
@@ -90,6 +53,7 @@ class BisimPolicy(SACPolicy):
         *,
         objective: Objective,
         bf16: bool = False,
+        random_shift: int = 0,
         features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         features_extractor_kwargs: dict[str, Any] | None = None,
         share_features_extractor: bool = True,
@@ -103,6 +67,7 @@ class BisimPolicy(SACPolicy):
         kwargs.setdefault("activation_fn", RELU)
         self.objective = objective
         self.bf16 = bf16
+        self.random_shift = random_shift
         self.inverse_dynamics_optimizer_kwargs = {**INVERSE_DYNAMICS_ADAM, **(inverse_dynamics_optimizer_kwargs or {})}
         self.ortho_init = ortho_init
         if optimizer_class in (th.optim.Adam, th.optim.AdamW):
@@ -138,20 +103,39 @@ class BisimPolicy(SACPolicy):
 
     def encode(self, replay_data: ReplayBufferSamples) -> tuple[ReplayBufferSamples, Batch]:
         """
-        Encode a batch, each observation once.
+        Encode a batch, each observation once; images are shifted at random before, if that is asked for.
 
         :param replay_data: a batch of transitions
         :return: the batch for actor and critics, its observations encoded; and the same for the representation
         """
         encoder, target_encoder = self.critic.features_extractor, self.critic_target.features_extractor
-        obs, next_obs = (Encoded(encoder.preprocess(o)) for o in (replay_data.observations, replay_data.next_observations))
+        observations = (replay_data.observations, replay_data.next_observations)
+        if self.random_shift:
+            observations = tuple(random_shift(images, self.random_shift) for images in observations)  # type: ignore[assignment]
+        obs, next_obs = (Encoded(encoder.preprocess(o)) for o in observations)
         z = obs[encoder]
-        with th.set_grad_enabled(self.objective.inverse_dynamics_coef > 0):  # no other loss goes through s'
+        metric = self.objective.metric
+        with th.set_grad_enabled(self.objective.inverse_dynamics_coef > 0 or metric.absorbing):
             next_z = next_obs[encoder]
         with th.no_grad():
             target_next_z = next_obs[target_encoder]
-        batch = Batch(z, replay_data.actions, replay_data.rewards, replay_data.dones, next_z, target_next_z)
+            target_z = obs[target_encoder] if metric.target_encoder == "both" else None
+        batch = Batch(z, replay_data.actions, replay_data.rewards, replay_data.dones, next_z, target_next_z, target_z)
         return replay_data._replace(observations=obs, next_observations=next_obs), batch  # type: ignore[arg-type]
+
+    @th.no_grad()
+    def bonus(self, obs: Any, actions: np.ndarray, next_obs: Any) -> np.ndarray:
+        """
+        The intrinsic reward of transitions (sec:intrinsic).
+
+        :param obs: observations as the policy takes them, n rows
+        :param actions: (n, n_a) in the scale of the action space
+        :param next_obs: true successors, n rows
+        :return: (n,)
+        """
+        z, next_z = (self.critic.features_extractor.encode(self.obs_to_tensor(o)[0]) for o in (obs, next_obs))
+        scaled = th.as_tensor(self.scale_action(actions), dtype=th.float32, device=self.device).flatten(1)
+        return self.representation.bonus(z, scaled, next_z).cpu().numpy()
 
     def actor_parameters(self) -> list[nn.Parameter]:
         """What the actor loss trains: all of the actor but an encoder that the critic owns, and what has been frozen."""
@@ -160,7 +144,8 @@ class BisimPolicy(SACPolicy):
 
     def make_features_extractor(self) -> Encoder:
         extractor = super().make_features_extractor()
-        return Encoder(extractor, self.observation_space, self.objective.radius, self.bf16, self.normalize_images)
+        shape = (self.objective.radius, self.objective.norm_constraint == "sphere")
+        return Encoder(extractor, self.observation_space, *shape, self.bf16, self.normalize_images)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> BisimActor:
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
@@ -176,7 +161,14 @@ class BisimPolicy(SACPolicy):
         self.representation.train(mode)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        own = ("objective", "bf16", "share_features_extractor", "inverse_dynamics_optimizer_kwargs", "ortho_init")
+        own = (
+            "objective",
+            "bf16",
+            "random_shift",
+            "share_features_extractor",
+            "inverse_dynamics_optimizer_kwargs",
+            "ortho_init",
+        )
         return {**super()._get_constructor_parameters(), **{name: getattr(self, name) for name in own}}
 
 
@@ -193,6 +185,9 @@ class MultiInputPolicy(BisimPolicy):
     """:class:`BisimPolicy` for Dict observations: the encoder is :class:`CombinedEncoder` by default."""
 
     default_encoder = CombinedEncoder
+
+
+POLICIES: dict[str, type[BasePolicy]] = {"MlpPolicy": MlpPolicy, "CnnPolicy": CnnPolicy, "MultiInputPolicy": MultiInputPolicy}
 
 
 def _fused(adam_kwargs: dict[str, Any]) -> dict[str, Any]:

@@ -1,16 +1,14 @@
 """What shapes the embedding beside the critic: metric, dynamics, reward and inverse dynamics, with their weights."""
 
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
 import torch as th
 from torch import nn
-from torch.nn import functional as F
 
 from sb3_robust_bisim import losses
-from sb3_robust_bisim.latent_models import DYNAMICS, DynamicsModel, InverseDynamicsModel, reward_model
-from sb3_robust_bisim.losses import DISTANCES
+from sb3_robust_bisim.latent_models import DynamicsModel, InverseDynamicsModel, Prediction, RewardModel
+from sb3_robust_bisim.metrics import METRIC_LOSSES
+from sb3_robust_bisim.objective import Objective
 
 
 class Batch(NamedTuple):
@@ -23,6 +21,7 @@ class Batch(NamedTuple):
     :param dones: (B, 1), 1 where the episode ended by a true termination
     :param next_z: (B, n) embeddings of the successors; with gradient where a loss sends one through them
     :param target_next_z: (B, n) embeddings of the successors by the target encoder, without gradient
+    :param target_z: (B, n) embeddings of the observations by the target encoder; None where no metric asks for them
     """
 
     z: th.Tensor
@@ -31,70 +30,7 @@ class Batch(NamedTuple):
     dones: th.Tensor
     next_z: th.Tensor
     target_next_z: th.Tensor
-
-
-@dataclass
-class Objective:
-    """
-    Settings of the representation, checked when they are made. BisimSAC documents them; c_T is a number here.
-
-    :raises ValueError: for a setting outside its range, or settings that contradict each other
-    """
-
-    bisim_coef: float
-    c_r: float
-    c_t: float
-    reward_range: tuple[float, float]
-    norm_constraint: bool
-    distance: str
-    dynamics: str
-    model_coef: float | None
-    intrinsic_reward_scale: float
-    intrinsic_reward_max: float
-    inverse_dynamics_coef: float
-
-    def __post_init__(self) -> None:
-        for name in ("bisim_coef", "c_r", "intrinsic_reward_scale", "intrinsic_reward_max", "inverse_dynamics_coef"):
-            self._require(_is_number(getattr(self, name), 0), name, "a finite number >= 0")
-        self._require(_is_number(self.model_weight, 0), "model_coef", "None or a finite number >= 0")
-        remedy = "above 0 where bisim_coef or intrinsic_reward_scale needs the dynamics model"
-        self._require(self.model_coef != 0 or not self._needs_model, "model_coef", remedy)
-        self._require(_is_number(self.c_t, 0) and self.c_t < 1, "c_t", "None (gamma) or in [0, 1), else no metric exists")
-        ordered = bool(
-            isinstance(self.reward_range, (tuple, list))
-            and len(self.reward_range) == 2
-            and all(map(_is_number, self.reward_range))
-            and self.reward_range[0] < self.reward_range[1]
-        )
-        self._require(ordered, "reward_range", "(R_min, R_max), finite, with R_min < R_max")
-        self._require(isinstance(self.norm_constraint, (bool, np.bool_)), "norm_constraint", "True or False")
-        point = self.norm_constraint and self.c_r == 0
-        self._require(not point, "c_r", "above 0, or norm_constraint=False: the ball is a point")
-        self._require(self.distance in DISTANCES, "distance", f"one of {', '.join(DISTANCES)}")
-        self._require(self.dynamics in DYNAMICS, "dynamics", f"one of {', '.join(DYNAMICS)}")
-
-    def _require(self, condition: bool, name: str, remedy: str) -> None:
-        if not condition:
-            raise ValueError(f"{name}={getattr(self, name)!r}: it must be {remedy}.")
-
-    @property
-    def model_weight(self) -> float:
-        """Weight of dynamics and reward loss: ``model_coef``, or if that is None 1 where a model is needed, else 0."""
-        return float(self._needs_model) if self.model_coef is None else self.model_coef
-
-    @property
-    def _needs_model(self) -> bool:
-        return self.bisim_coef > 0 or self.intrinsic_reward_scale > 0
-
-    @property
-    def radius(self) -> float | None:
-        """Radius of the ball that holds the embeddings (eq:constraint), None without ``norm_constraint``."""
-        return losses.ball_radius(self.c_r, self.c_t, self.reward_range) if self.norm_constraint else None
-
-    @property
-    def ratio_target(self) -> float:
-        """c_R / (1 - c_T), where mu_bd / mu_rd converges to (eq:reward-dependence2)."""
-        return self.c_r / (1 - self.c_t)
+    target_z: th.Tensor | None = None
 
 
 class Representation(nn.Module):
@@ -113,7 +49,7 @@ class Representation(nn.Module):
         super().__init__()
         self.objective = objective
         self.dynamics = DynamicsModel(features_dim, action_dim, objective.dynamics, objective.radius)
-        self.reward_model = reward_model(features_dim)
+        self.reward_model = RewardModel(features_dim, objective.metric.loss == "variance_corrected")
         self.inverse_dynamics = InverseDynamicsModel(features_dim, action_dim)
 
     def losses(self, batch: Batch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
@@ -124,25 +60,65 @@ class Representation(nn.Module):
         """
         objective = self.objective
         total, logged = batch.z.new_zeros(()), {}
-        if objective.bisim_coef > 0 or objective.model_weight > 0:
+        prediction = reward_variance = None
+        if objective.model_weight > 0 or objective.needs_model:
             prediction = self.dynamics(batch.z, batch.actions)
-        if objective.model_weight > 0:
-            predicted_rewards = self.reward_model(self.dynamics.sample(prediction))
-            logged["train/dynamics_loss"] = losses.dynamics_loss(prediction.mean, prediction.std, batch.next_z)
-            logged["train/reward_loss"] = F.mse_loss(predicted_rewards, batch.rewards)
-            total = total + objective.model_weight * (logged["train/dynamics_loss"] + logged["train/reward_loss"])
-        if objective.bisim_coef > 0:
-            mean, std = prediction.moments()
-            pairs = th.randperm(len(batch.z), device=batch.z.device)
-            logged["train/bisim_loss"], logged["bisim/mu_bd"], logged["bisim/mu_rd"] = losses.bisim_loss(
-                batch.z, batch.rewards, mean, std, pairs, objective.c_r, objective.c_t, objective.distance
+            logged["train/dynamics_loss"] = losses.dynamics_loss(
+                prediction.mean, prediction.std, batch.next_z, objective.nll_beta
             )
-            total = total + objective.bisim_coef * logged["train/bisim_loss"]
+            total = total + objective.model_weight * logged["train/dynamics_loss"]
+            if objective.reward_weight > 0:
+                predicted_rewards, reward_std = self.reward_model(self.dynamics.sample(prediction))
+                logged["train/reward_loss"] = losses.reward_loss(predicted_rewards, reward_std, batch.rewards)
+                total = total + objective.reward_weight * logged["train/reward_loss"]
+                reward_variance = None if reward_std is None else reward_std.detach().square()
+        if objective.bisim_coef > 0:
+            bisim_loss, means = self._metric_loss(batch, prediction, reward_variance)
+            total = total + objective.bisim_coef * bisim_loss
+            logged |= {"train/bisim_loss": bisim_loss, **means}
         if objective.inverse_dynamics_coef > 0:
             predicted_actions = self.inverse_dynamics(batch.z, batch.next_z)
             logged["train/inverse_dynamics_loss"] = losses.inverse_dynamics_loss(predicted_actions, batch.actions)
             total = total + objective.inverse_dynamics_coef * logged["train/inverse_dynamics_loss"]
         return total, logged
+
+    def _metric_loss(
+        self, batch: Batch, prediction: Prediction | None, variance: th.Tensor | None
+    ) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        """
+        :return: the loss and, for diagnosis, mu_bd and mu_rd (eq:reward-dependence2): mean distances of states and rewards
+        """
+        metric, z, rewards = self.objective.metric, batch.z, batch.rewards
+        other_z = z
+        if metric.target_encoder == "both":
+            assert batch.target_z is not None
+            other_z = batch.target_z
+        if metric.successors == "sample":
+            following = batch.next_z.detach() if metric.target_encoder == "none" else batch.target_next_z
+            successors: tuple[th.Tensor, th.Tensor | None] = (following, None)
+        else:
+            assert prediction is not None
+            successors = prediction.moments()
+        weights = None
+        if metric.absorbing:
+            # every successor is a row of its own, which follows itself without reward; only terminal ones count
+            weights = th.cat([th.ones_like(batch.dones), batch.dones])
+            ends, other_ends = batch.next_z, batch.next_z if other_z is z else batch.target_next_z
+            (mean, std), end = successors, ends.detach() if metric.target_encoder == "none" else batch.target_next_z
+            successors = th.cat([mean, end]), None if std is None else th.cat([std, th.zeros_like(std)])
+            z, other_z, rewards = th.cat([z, ends]), th.cat([other_z, other_ends]), th.cat([rewards, th.zeros_like(rewards)])
+            variance = None if variance is None else th.cat([variance, th.zeros_like(variance)])
+        gaps, (i, j) = metric.gaps(z, other_z, rewards, successors, variance)
+        losses_of_pairs = METRIC_LOSSES[metric.loss](gaps, metric.c_r, metric.c_t)
+
+        def mean_over_pairs(values: th.Tensor) -> th.Tensor:
+            if weights is None:
+                return values.mean()
+            weight = weights[i] * weights[j]
+            return (values * weight).sum() / (weight.sum() * values.shape[-1])
+
+        means = {"bisim/mu_bd": mean_over_pairs(gaps.z.detach()), "bisim/mu_rd": mean_over_pairs(gaps.reward)}
+        return mean_over_pairs(losses_of_pairs), means
 
     def bonus(self, z: th.Tensor, actions: th.Tensor, next_z: th.Tensor) -> th.Tensor:
         """
@@ -173,12 +149,3 @@ class Representation(nn.Module):
         if (radius := self.objective.radius) is not None:
             statistics["bisim/clamp_fraction"] = losses.on_surface(norm, radius).float().mean()
         return statistics
-
-
-def _is_number(value: Any, least: float = -np.inf) -> bool:
-    """Whether a value is a finite number (a bool is none) and at least ``least``."""
-    return (
-        isinstance(value, (int, float, np.number))
-        and not isinstance(value, bool)
-        and bool(np.isfinite(value) and value >= least)
-    )

@@ -1,8 +1,8 @@
 import os
 
-# Tests run beside each other, one thread each: two spinning thread pools on two cores are slower than none
+# Tests run in parallel processes with one thread each, because competing thread pools slow each other down
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-# They compare bit by bit, which a GPU does not promise; CUDA_VISIBLE_DEVICES=0 shows it to them
+# They compare bit by bit, and a GPU is not bit-exact. Set CUDA_VISIBLE_DEVICES=0 to test on a GPU anyway
 os.environ.setdefault("CUDA_VISIBLE_DEVICES", "")
 
 import torch as th

@@ -1,4 +1,4 @@
-"""Small finite MDPs, drawn by Hypothesis or written down, for the tests of the theory."""
+"""Small finite MDPs for the tests of the theory. Hypothesis draws some, others are written out."""
 
 from dataclasses import dataclass
 
@@ -43,26 +43,26 @@ def mdps(
 
 @st.composite
 def mdps_with_policy(draw: st.DrawFn, deterministic: bool = False) -> tuple[FiniteMDP, Array]:
-    """An MDP and a policy; both deterministic or neither."""
+    """An MDP and a policy. Either both are deterministic or neither is."""
     mdp = draw(mdps(deterministic=deterministic))
     return mdp, draw(distributions(mdp.n_states, mdp.n_actions, deterministic))
 
 
 def chain(transition: list[list[float]], reward: list[float]) -> tuple[FiniteMDP, Array]:
-    """A Markov chain as an MDP with one action, and the only policy there is."""
+    """A Markov chain as an MDP with one action, and its only policy."""
     return FiniteMDP(np.array(transition)[:, None], np.array(reward)[:, None]), np.ones((len(reward), 1))
 
 
-# Two states with reward 0 that lead for ever to reward 0 and to reward 1.
+# Two states with reward 0. One leads to reward 0 for ever, the other to reward 1.
 FORK = chain([[0, 0, 1, 0], [0, 0, 0, 1], [0, 0, 1, 0], [0, 0, 0, 1]], [0, 0, 0, 1])
 BEFORE_FORK = [0.5, 0.5, 0.0, 0.0]
-# Three states which never change and differ pairwise under one of three actions.
+# Three states that never change. Each pair differs under one of three actions.
 THREE_APART = FiniteMDP(np.repeat(np.eye(3)[:, None], 3, axis=1), np.eye(3))
 
 
 @dataclass
 class Setting:
-    """A random MDP with policy and weights; rewards have the span ``span`` and need not lie in [0, 1]."""
+    """A random MDP with policy and weights. The rewards have the span ``span`` and may lie outside of [0, 1]."""
 
     mdp: FiniteMDP
     policy: Array

@@ -1,21 +1,66 @@
-"""The small BisimSAC, with every extra on, and its short episodes that several test files share."""
+"""The small BisimSAC of the tests, its small environments, and what several test files ask about a model."""
 
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import torch as th
+from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
+from stable_baselines3.common.vec_env import VecEnv
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch import nn
+
+from sb3_robust_bisim import BisimSAC
 
 EPISODE = 10
-SMALL: dict[str, Any] = dict(
-    policy_kwargs=dict(net_arch=[16]),
-    learning_starts=EPISODE,
-    batch_size=8,
-    buffer_size=50,
-    seed=0,
-    intrinsic_reward_scale=1.0,
-    inverse_dynamics_coef=1.0,
-)
+# Small nets and buffers; training starts after one episode
+SMALL: dict[str, Any] = dict(policy_kwargs=dict(net_arch=[16]), learning_starts=EPISODE, batch_size=8, buffer_size=100, seed=0)
+# The parts of the method that are off by default
+EVERYTHING: dict[str, Any] = dict(intrinsic_reward_scale=1.0, inverse_dynamics_coef=1.0)
 
 
-def pendulum() -> gym.Env:
-    """Actions in [-2, 2]; its short episodes end by time-out."""
-    return gym.make("Pendulum-v1", max_episode_steps=EPISODE)
+def pendulum(reward: float | None = None) -> gym.Env:
+    """Actions in [-2, 2]. Short episodes that end by time-out, in which every step pays ``reward`` if one is given."""
+    env = gym.make("Pendulum-v1", max_episode_steps=EPISODE)
+    return env if reward is None else gym.wrappers.TransformReward(env, lambda _: reward)
+
+
+def images() -> gym.Env:
+    """Random grey images of 12 x 12 pixels, channel last."""
+    return FakeImageEnv(screen_height=12, screen_width=12, n_channels=1, discrete=False)
+
+
+def dicts() -> gym.Env:
+    """Observations that are dicts of a vector and an image."""
+    return SimpleMultiObsEnv(discrete_actions=False)
+
+
+def make_model(policy: Any = "MlpPolicy", env: Any = None, **kwargs: Any) -> Any:
+    """A small BisimSAC with every part switched on. Its type is Any because many attributes of an algorithm are Optional."""
+    return BisimSAC(policy, pendulum() if env is None else env, **{**SMALL, **EVERYTHING, **kwargs})
+
+
+def with_data(*args: Any, **kwargs: Any) -> Any:
+    """A model with 20 random transitions and no update yet, for tests that call ``train`` themselves."""
+    return make_model(*args, **{"learning_starts": 1000, **kwargs}).learn(20)
+
+
+def parameters(module: nn.Module) -> th.Tensor:
+    """A copy of all parameters of a module as one vector."""
+    return nn.utils.parameters_to_vector(module.parameters()).detach().clone()
+
+
+def layers(env: VecEnv | None) -> list[VecEnv]:
+    """The wrappers of a VecEnv from the outside in, and last the VecEnv inside of them."""
+    found = []
+    while env is not None:
+        found.append(env)
+        env = getattr(env, "venv", None)
+    return found
+
+
+def events(folder: Path) -> EventAccumulator:
+    """What a first run of BisimSAC with this ``tensorboard_log`` has written."""
+    accumulator = EventAccumulator(str(folder / "BisimSAC_1"), size_guidance={"images": 0})
+    accumulator.Reload()
+    return accumulator

@@ -1,4 +1,4 @@
-"""What cannot work is refused before any work starts, by a message that names the argument and its value."""
+"""BisimSAC refuses bad input before any work starts. Each message names the argument and its value."""
 
 import re
 from collections.abc import Callable
@@ -9,9 +9,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from small_models import SMALL, pendulum
+from small_models import SMALL, dicts, images, make_model, pendulum
 from stable_baselines3.common.buffers import NStepReplayBuffer
-from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv, SimpleMultiObsEnv
+from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 from stable_baselines3.sac.policies import SACPolicy
@@ -24,18 +24,6 @@ NAN, INF = float("nan"), float("inf")
 
 def venv() -> VecEnv:
     return DummyVecEnv([pendulum])
-
-
-def images() -> gym.Env:
-    return FakeImageEnv(screen_height=12, screen_width=12, n_channels=1, discrete=False)
-
-
-def dicts() -> gym.Env:
-    return SimpleMultiObsEnv(discrete_actions=False)
-
-
-def make_model(policy: Any = "MlpPolicy", env: Any = None, **kwargs: Any) -> Any:
-    return BisimSAC(policy, pendulum() if env is None else env, **{**SMALL, **kwargs})
 
 
 WEIGHTS = ("bisim_coef", "c_r", "model_coef", "intrinsic_reward_scale", "intrinsic_reward_max", "inverse_dynamics_coef")
@@ -74,7 +62,7 @@ def test_settings_without_a_meaning_are_refused(settings: dict[str, Any], messag
         make_model(**settings)
 
 
-def test_the_same_settings_are_taken_where_they_have_one() -> None:
+def test_the_same_settings_are_accepted_where_they_have_a_meaning() -> None:
     make_model(gamma=1.0, c_t=0.9)
     make_model(c_r=0, norm_constraint=False)
     make_model(c_t=0, bisim_coef=0, model_coef=0, intrinsic_reward_scale=0, intrinsic_reward_max=0, reward_range=[-1, 0])
@@ -84,12 +72,12 @@ def test_the_same_settings_are_taken_where_they_have_one() -> None:
     ("wrong", "right"),
     [("bisim_coeff", "bisim_coef"), ("intrinsic_reward", "intrinsic_reward_max"), ("learning_start", "learning_starts")],
 )
-def test_a_misspelt_argument_is_refused_with_the_right_one(wrong: str, right: str) -> None:
+def test_a_misspelt_argument_is_refused_and_the_right_one_suggested(wrong: str, right: str) -> None:
     with pytest.raises(TypeError, match=rf"no argument '{wrong}' \(value 3\), did you mean '{right}'\?"):
         make_model(**{wrong: 3})
 
 
-def test_an_argument_like_no_other_is_refused() -> None:
+def test_an_argument_that_resembles_no_other_is_refused() -> None:
     with pytest.raises(TypeError, match=r"no argument 'xyz' \(value 3\): see the documentation"):
         make_model(xyz=3)
 
@@ -139,7 +127,7 @@ CHAINS: list[tuple[Callable[[], VecEnv], str]] = [
 
 
 @pytest.mark.parametrize(("chain", "message"), CHAINS)
-def test_wrappers_in_the_wrong_order_are_refused_at_every_door(
+def test_wrappers_in_the_wrong_order_are_refused_by_constructor_set_env_and_load(
     chain: Callable[[], VecEnv], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match=message):
@@ -160,7 +148,7 @@ def test_a_bonus_below_a_frame_stack_is_refused(policy: str, env: Callable[[], g
         make_model(policy, VecFrameStack(IntrinsicRewardVecEnv(DummyVecEnv([env])), 2))
 
 
-def test_another_number_of_environments_is_refused_and_stays_unbound() -> None:
+def test_set_env_refuses_another_number_of_environments_and_binds_nothing() -> None:
     model, other = make_model(intrinsic_reward_scale=1.0), IntrinsicRewardVecEnv(DummyVecEnv([pendulum, pendulum]))
     with pytest.raises(AssertionError, match="number of environments"):
         model.set_env(other)
@@ -171,12 +159,12 @@ def test_another_number_of_environments_is_refused_and_stays_unbound() -> None:
     ("name", "message"),
     [("objective", "BisimSAC sets it; pass its settings to BisimSAC"), ("bf16", "BisimSAC sets it; pass bf16 to BisimSAC")],
 )
-def test_what_bisim_sac_tells_its_policy_is_not_for_policy_kwargs(name: str, message: str) -> None:
+def test_policy_kwargs_that_bisim_sac_sets_itself_are_refused(name: str, message: str) -> None:
     with pytest.raises(ValueError, match=f"policy_kwargs with {name}=1: {message}"):
         make_model(policy_kwargs={name: 1})
 
 
-def test_an_environment_with_other_spaces_is_refused_as_such() -> None:
+def test_set_env_refuses_an_environment_with_other_spaces() -> None:
     with pytest.raises(ValueError, match="Observation spaces do not match"):
         make_model().set_env(gym.make("MountainCarContinuous-v0"))
 
@@ -194,7 +182,7 @@ def test_load_refuses_a_misspelt_argument(tmp_path: Path) -> None:
         BisimSAC.load(tmp_path / "model", bisim_coeff=0.1)
 
 
-def test_load_takes_the_arguments_of_a_subclass(tmp_path: Path) -> None:
+def test_load_accepts_the_arguments_of_a_subclass(tmp_path: Path) -> None:
     class Renamed(BisimSAC):
         def __init__(self, *args: Any, nickname: str = "", **kwargs: Any) -> None:
             super().__init__(*args, **kwargs)
@@ -207,7 +195,7 @@ def test_load_takes_the_arguments_of_a_subclass(tmp_path: Path) -> None:
 
 
 class RewardAt(gym.Wrapper):
-    """One reward of the run is not a number: a sensor that fails at step ``step``."""
+    """The reward of step ``step`` is not finite, as if a sensor had failed."""
 
     def __init__(self, step: int, reward: float) -> None:
         super().__init__(pendulum())
@@ -220,14 +208,14 @@ class RewardAt(gym.Wrapper):
 
 
 @pytest.mark.parametrize("reward", [NAN, INF])
-def test_a_reward_that_is_not_finite_stops_training_and_tells_where(reward: float) -> None:
-    model = make_model(env=RewardAt(14, reward), batch_size=300)  # so large a batch misses no transition
+def test_a_reward_that_is_not_finite_stops_training_and_the_message_says_where(reward: float) -> None:
+    model = make_model(env=RewardAt(14, reward), batch_size=300)  # a batch this large misses no transition
     with pytest.raises(ValueError, match=rf"train/critic_loss became {reward} at update 4: training has stopped"):
         model.learn(30)
     assert model.num_timesteps == 14
 
 
-def test_the_first_loss_to_break_is_named_before_those_that_follow() -> None:
+def test_the_message_names_the_first_loss_that_breaks() -> None:
     model = make_model().learn(20)
     inner, calls = model.policy.representation.dynamics.forward, []
 
@@ -242,14 +230,14 @@ def test_the_first_loss_to_break_is_named_before_those_that_follow() -> None:
         model.train(gradient_steps=10, batch_size=8)
 
 
-def test_the_update_is_named_also_inside_many_gradient_steps() -> None:
+def test_the_message_names_the_update_among_many_gradient_steps() -> None:
     model = make_model(env=RewardAt(14, NAN), batch_size=300, train_freq=5, gradient_steps=6)
     with pytest.raises(ValueError, match="train/critic_loss became nan at update 1: training has stopped"):
         model.learn(30)
 
 
 @pytest.mark.parametrize("gradient_steps", [1, 5])
-def test_an_exploding_learning_rate_stops_training_and_tells_where(gradient_steps: int) -> None:
+def test_a_far_too_high_learning_rate_stops_training_and_the_message_says_where(gradient_steps: int) -> None:
     model = make_model(learning_rate=100.0, gradient_steps=gradient_steps)
     with pytest.raises(ValueError, match=r"train/critic_loss became (nan|inf) at update \d: .* lower learning_rate"):
         model.learn(30)

@@ -1,4 +1,4 @@
-"""What the diagnostics write, read back from the event files; and that they leave the run alone."""
+"""The callbacks write the right numbers and pictures to the event files. They do not change the run."""
 
 import math
 from pathlib import Path
@@ -10,12 +10,12 @@ import pytest
 import torch as th
 import yaml
 from rl_zoo3.utils import get_callback_list
+from small_models import SMALL, events
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_robust_bisim import BisimSAC
 from sb3_robust_bisim.callbacks import DenoisingFactorCallback, EmbeddingCallback, ValueBoundCallback, diagnostic
@@ -24,14 +24,12 @@ from sb3_robust_bisim.cli import zoo
 from sb3_robust_bisim.envs import NoiseObservation
 from sb3_robust_bisim.runs.checkpoint import Checkpoint, load_checkpoint
 
-SETTINGS: dict[str, Any] = dict(
-    policy_kwargs=dict(net_arch=[16]), learning_starts=20, batch_size=16, buffer_size=200, train_freq=10, seed=0
-)
+SETTINGS: dict[str, Any] = {**SMALL, "learning_starts": 20, "batch_size": 16, "buffer_size": 200, "train_freq": 10}
 NOISY = "robust_bisim/SparseCartPole-v0"
 
 
 class Picture(gym.Env):
-    """The state is one of 256 shades of an 8x8 frame, on top of which lies noise; steps 1 to 6 pay 0, 0, 0, 1, 1, 1."""
+    """The state is the shade of an 8x8 frame, and noise is added to it. Steps 1 to 6 pay 0, 0, 0, 1, 1, 1."""
 
     observation_space = gym.spaces.Box(0, 255, (8, 8, 3), np.uint8)
     action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
@@ -73,7 +71,7 @@ gym.register("test/Doubled-v0", doubled)  # type: ignore[arg-type]
 
 
 class Wave(gym.Env):
-    """An environment without an id, that only ever begins."""
+    """An environment without an id, which can only be reset."""
 
     observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
     action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
@@ -83,7 +81,7 @@ class Wave(gym.Env):
 
 
 class FlatEncoder(th.nn.Module):
-    """z = the first two numbers of the observation, or of the noise at its end."""
+    """z is one slice of the observation, for example its first two numbers or the noise at its end."""
 
     def __init__(self, where: slice) -> None:
         super().__init__()
@@ -91,12 +89,6 @@ class FlatEncoder(th.nn.Module):
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
         return th.nn.functional.pad(obs.flatten(1)[:, self.where], (0, 48))
-
-
-def events(folder: Path) -> EventAccumulator:
-    accumulator = EventAccumulator(str(folder / "BisimSAC_1"), size_guidance={"images": 0})
-    accumulator.Reload()
-    return accumulator
 
 
 def scalars(folder: Path, key: str) -> np.ndarray:
@@ -116,7 +108,7 @@ def learn(
 def test_the_projector_holds_each_state_with_its_value_and_reward(tmp_path: Path) -> None:
     model = learn(tmp_path, EmbeddingCallback(every=25, n_states=40))
     folders = sorted(path.name for path in (tmp_path / "BisimSAC_1").iterdir() if path.is_dir())
-    assert folders == ["00025", "00050", "00060"]  # and once more at the end
+    assert folders == ["00025", "00050", "00060"]  # the last one at the end of training
     last = tmp_path / "BisimSAC_1" / "00060" / "embedding"
     z = np.loadtxt(last / "tensors.tsv")
     header, *rows = (last / "metadata.tsv").read_text().splitlines()
@@ -147,7 +139,7 @@ def test_the_plane_of_the_principal_components_is_drawn(tmp_path: Path) -> None:
     assert images[0].encoded_image_string != images[1].encoded_image_string
 
 
-def test_the_projector_shows_of_hindsight_replay_what_may_be_drawn(tmp_path: Path) -> None:
+def test_the_projector_shows_only_the_finished_episodes_of_hindsight_replay(tmp_path: Path) -> None:
     env = gym.wrappers.TimeLimit(BitFlippingEnv(n_bits=10, continuous=True, max_steps=100), 30)
     learn(
         tmp_path,
@@ -174,7 +166,7 @@ def test_frames_become_sprites(tmp_path: Path) -> None:
     assert len((folder / "metadata.tsv").read_text().splitlines()) == 5
 
 
-def test_of_three_grey_frames_the_newest_becomes_a_grey_sprite() -> None:
+def test_the_newest_of_three_grey_frames_becomes_a_grey_sprite() -> None:
     callback = EmbeddingCallback()
     callback.model = BisimSAC("CnnPolicy", VecFrameStack(DummyVecEnv([lambda: GreyEnv()]), 3), buffer_size=10)
     stack = th.tensor([0, 100, 200], dtype=th.uint8).reshape(1, 3, 1, 1).expand(1, 3, 8, 8)
@@ -182,7 +174,7 @@ def test_of_three_grey_frames_the_newest_becomes_a_grey_sprite() -> None:
 
 
 def slow_denoising_factor(anchors: np.ndarray, positives: np.ndarray) -> float:
-    """The definition, pair by pair: (N, n) anchors, (K, N, n) positives."""
+    """The definition as loops over pairs of (N, n) anchors and (K, N, n) positives."""
     own, other = [], []
     for i, anchor in enumerate(anchors):
         for j in range(len(anchors)):
@@ -194,7 +186,7 @@ def slow_denoising_factor(anchors: np.ndarray, positives: np.ndarray) -> float:
 
 
 class Watching(th.nn.Module):
-    """A small linear encoder that keeps the batches of more than one observation, each of them once."""
+    """A small linear encoder. It keeps each batch of more than one observation once."""
 
     def __init__(self, n_inputs: int) -> None:
         super().__init__()
@@ -207,7 +199,7 @@ class Watching(th.nn.Module):
         return obs @ self.weights.T
 
 
-def test_the_denoising_factor_is_that_of_the_literature() -> None:
+def test_the_denoising_factor_agrees_with_its_definition() -> None:
     rng = np.random.default_rng(0)
     states = rng.normal(size=(7, 3))
     anchors, positives = states + 0.5 * rng.normal(size=(7, 3)), states + 0.5 * rng.normal(size=(4, 7, 3))
@@ -215,16 +207,14 @@ def test_the_denoising_factor_is_that_of_the_literature() -> None:
     assert found == pytest.approx(slow_denoising_factor(anchors, positives), abs=1e-12)
     # a state at 3 and one at 0, seen at 1 and 0: own distances 2 and 0, others 3 and 1
     assert denoising_factor(th.tensor([[3.0], [0.0]]), th.tensor([[[1.0], [0.0]]])) == pytest.approx((2 - 1) / (2 + 1))
-    # embeddings far from the origin that do not change with the noise have a distance of 0, and not nearly 0
+    # embeddings that ignore the noise have a distance of exactly 0, even far from the origin
     still = th.as_tensor(100 + rng.normal(size=(50, 50)), dtype=th.float32)
     assert denoising_factor(still, still[None].repeat(3, 1, 1)) == 1.0
     assert denoising_factor(th.ones(50, 5), th.ones(3, 50, 5)) == 0.0  # one point
 
 
 @pytest.mark.parametrize("random_projection", [False, True])
-def test_the_callback_measures_anchors_and_positives_of_the_same_states_that_are_noisy_alike(
-    random_projection: bool, tmp_path: Path
-) -> None:
+def test_anchors_and_positives_show_the_same_states_under_independent_noise(random_projection: bool, tmp_path: Path) -> None:
     env = gym.make(NOISY, noise_multiplier=1, random_projection=random_projection)
     model = learn(None, None, steps=1, env=env, norm_constraint=False)
     encoder = Watching(8)
@@ -244,14 +234,14 @@ def test_the_callback_measures_anchors_and_positives_of_the_same_states_that_are
         np.testing.assert_allclose(state, state[:1].repeat(6, axis=0), atol=1e-4)
         assert np.unique(state[0].round(3), axis=0).shape == (20, 4)
         assert abs(noise.mean() - (100 if key else 0)) < 0.2
-        # neither is the noise of any look that of another
+        # the noise of each look differs from that of the others
         assert np.unique(noise.round(4)).size > 0.9 * noise.size
         assert noise.std() == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.parametrize("n_stack", [1, 3])
 @pytest.mark.parametrize(("where", "expected"), [(slice(0, 2), 1.0), (slice(-2, None), 0.0)])
-def test_the_denoising_factor_tells_states_from_noise(where: slice, expected: float, n_stack: int, tmp_path: Path) -> None:
+def test_the_denoising_factor_separates_states_from_noise(where: slice, expected: float, n_stack: int, tmp_path: Path) -> None:
     env = VecFrameStack(make_vec_env(NOISY, env_kwargs=dict(noise_multiplier=2)), n_stack)
     model = learn(None, None, steps=1, env=env)
     model.critic.features_extractor.extractor.net = FlatEncoder(where)
@@ -267,7 +257,7 @@ def test_the_denoising_factor_compares_stacked_frames_with_their_clean_ones(tmp_
         callback = DenoisingFactorCallback(40, 30, env_kwargs=dict(clean_obs=True), eval_env_kwargs=dict(noise=0))
         learn(folder, callback, 40, env, policy="CnnPolicy")
         assert scalars(folder, "bisim/denoising_factor_heldout") == pytest.approx(1.0)
-    assert scalars(tmp_path / "0", "bisim/denoising_factor") == pytest.approx(1.0)  # without noise both looks are one
+    assert scalars(tmp_path / "0", "bisim/denoising_factor") == pytest.approx(1.0)  # both looks are equal without noise
     assert scalars(tmp_path / "128", "bisim/denoising_factor") < 0.9
 
 
@@ -277,7 +267,7 @@ def test_no_held_out_number_is_recorded_unless_asked_for(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(("time_out", "rest"), [(False, 0.0), (True, 2.0)])
-def test_exact_distances_keep_the_bound_and_a_collapsed_embedding_breaks_it(
+def test_exact_distances_satisfy_the_bound_and_a_collapsed_embedding_violates_it(
     time_out: bool, rest: float, tmp_path: Path
 ) -> None:
     # steps 0 to 5 are followed by the rewards 0, 0, 0, 1, 1, 1 and, if time ran out, by what the critic expects
@@ -299,7 +289,7 @@ def test_exact_distances_keep_the_bound_and_a_collapsed_embedding_breaks_it(
         assert found["bound_violations"] == (0 if scale > 1 else pytest.approx(5 / 6, abs=0.05))  # all but equal states
 
 
-def test_a_watched_run_is_bit_for_bit_the_run_without(tmp_path: Path) -> None:
+def test_callbacks_leave_the_trained_weights_the_same_bit_for_bit(tmp_path: Path) -> None:
     denoising = DenoisingFactorCallback(20, 10, eval_env_kwargs=dict(noise_mean=1.0))
     callbacks = [EmbeddingCallback(20, 10), denoising, ValueBoundCallback(20, 10)]
     watched, alone = (learn(tmp_path, callback) for callback in (callbacks, None))
@@ -307,7 +297,7 @@ def test_a_watched_run_is_bit_for_bit_the_run_without(tmp_path: Path) -> None:
         assert th.equal(value, alone.policy.state_dict()[name]), name
 
 
-def test_a_run_that_goes_on_is_looked_at_at_the_same_steps(tmp_path: Path) -> None:
+def test_a_resumed_run_is_measured_at_the_same_steps(tmp_path: Path) -> None:
     checkpoint = tmp_path / "checkpoint.pkl"
     callback = DenoisingFactorCallback(every=30, n_states=10, eval_env_kwargs=dict(noise_mean=1.0))
     learn(tmp_path, [callback, Checkpoint(checkpoint, 40, context=callback)], steps=50)
@@ -316,10 +306,10 @@ def test_a_run_that_goes_on_is_looked_at_at_the_same_steps(tmp_path: Path) -> No
     model.learn(60, callback, reset_num_timesteps=False)
     for key in ("denoising_factor", "denoising_factor_heldout"):
         looks = events(tmp_path).Scalars(f"bisim/{key}")
-        assert [event.step for event in looks] == [30, 50, 60, 90, 100]  # 50 was the end of the part that is lost
+        assert [event.step for event in looks] == [30, 50, 60, 90, 100]  # step 50 ended the lost part
 
 
-def test_a_zoo_yaml_can_name_them(tmp_path: Path) -> None:
+def test_a_zoo_yaml_can_name_the_callbacks(tmp_path: Path) -> None:
     names = ["EmbeddingCallback", "DenoisingFactorCallback", "ValueBoundCallback"]
     first, *others = [f"sb3_robust_bisim.callbacks.{name}" for name in names]
     callbacks = get_callback_list({"callback": [first, *({name: {"every": 30, "n_states": 20}} for name in others)]})
@@ -356,12 +346,12 @@ def test_a_zoo_yaml_can_name_them(tmp_path: Path) -> None:
         (ValueBoundCallback(env_id="Pendulum-v1"), None, "Pendulum-v1"),
     ],
 )
-def test_what_cannot_work_is_refused_when_training_starts(callback: BaseCallback, env: Any, message: str) -> None:
+def test_callbacks_that_cannot_work_are_refused_when_training_starts(callback: BaseCallback, env: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         learn(None, callback, steps=10**9, env=env)
 
 
-def test_the_zoo_shows_why_training_did_not_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_zoo_shows_why_training_did_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     content = yaml.safe_load(zoo.DEFAULT_CONFIG.read_text())
     content[NOISY] |= {"callback": "sb3_robust_bisim.callbacks.ValueBoundCallback", "c_r": 0.0, "norm_constraint": False}
     (tmp_path / "config.yml").write_text(yaml.dump(content))
@@ -370,7 +360,7 @@ def test_the_zoo_shows_why_training_did_not_begin(tmp_path: Path, monkeypatch: p
         zoo.main(["train", "--env", NOISY, "-conf", str(tmp_path / "config.yml"), "-f", str(tmp_path), "--eval-freq", "-1"])
 
 
-def test_an_agent_that_has_broken_is_not_looked_at(tmp_path: Path) -> None:
+def test_an_agent_with_nan_weights_is_not_measured(tmp_path: Path) -> None:
     callback = EmbeddingCallback(every=10**6)
     model = learn(tmp_path, callback, steps=30)
     with th.no_grad():
@@ -380,12 +370,12 @@ def test_an_agent_that_has_broken_is_not_looked_at(tmp_path: Path) -> None:
     assert len(list(tmp_path.glob("BisimSAC_1/*/embedding/tensors.tsv"))) == 1
 
 
-def test_a_bound_needs_rewards_in_the_metric() -> None:
+def test_a_value_bound_needs_rewards_in_the_metric() -> None:
     with pytest.raises(ValueError, match="c_r > 0"):
         learn(None, ValueBoundCallback(), steps=10**9, c_r=0.0, norm_constraint=False)
 
 
-def test_episodes_without_end_are_named_in_place_of_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_endless_episodes_end_in_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(diagnostic, "LONGEST_WALK", 5)
     with pytest.raises(ValueError, match=r"n_states=20: ValueBoundCallback .* in 5 steps of robust_bisim/SparseCartPole-v0"):
         learn(None, ValueBoundCallback(n_states=20), steps=1)
@@ -397,12 +387,12 @@ def test_another_algorithm_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("name", "value"), [("every", 0), ("every", 2.5), ("n_states", 1)])
-def test_arguments_outside_their_range_are_refused(name: str, value: Any) -> None:
+def test_callback_arguments_outside_their_range_are_refused(name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=f"{name}={value}"):
         EmbeddingCallback(**{name: value})
 
 
 @pytest.mark.parametrize("value", [0, 1.5])
-def test_a_number_of_positives_that_is_none_is_refused(value: Any) -> None:
+def test_an_invalid_number_of_positives_is_refused(value: Any) -> None:
     with pytest.raises(ValueError, match=f"n_positives={value}: DenoisingFactorCallback needs an integer >= 1"):
         DenoisingFactorCallback(n_positives=value)

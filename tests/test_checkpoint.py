@@ -1,16 +1,17 @@
-"""Training that goes on from a checkpoint ends exactly as training that was never interrupted."""
+"""Training that resumes from a checkpoint ends exactly like training that was never interrupted."""
 
 import pickle
 import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch as th
 import yaml
-from small_models import SMALL
+from small_models import make_model
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.env_util import make_vec_env
@@ -25,11 +26,11 @@ from sb3_robust_bisim.runs.atomic import atomic_path
 from sb3_robust_bisim.runs.checkpoint import Checkpoint, load_checkpoint, read_about, save_checkpoint
 
 STEPS = 120
-LEARNING = {**SMALL, "learning_starts": 20, "buffer_size": 200}
+LEARNING: dict[str, Any] = dict(learning_starts=20, buffer_size=200)
 
 
 class StopAt(BaseCallback):
-    """Ends training at a step, as a kill would: what comes after the last checkpoint is lost."""
+    """Ends training at a step, like a kill. All steps after the last checkpoint are lost."""
 
     def __init__(self, step: int) -> None:
         super().__init__()
@@ -51,12 +52,12 @@ def pixel_task() -> VecEnv:
 
 def model_of(task: str) -> BisimSAC:
     if task == "state":
-        return BisimSAC("MlpPolicy", state_task(), **LEARNING)
-    return BisimSAC("CnnPolicy", pixel_task(), replay_buffer_class=FrameStackReplayBuffer, **LEARNING)
+        return make_model("MlpPolicy", state_task(), **LEARNING)
+    return make_model("CnnPolicy", pixel_task(), replay_buffer_class=FrameStackReplayBuffer, **LEARNING)
 
 
 @pytest.mark.parametrize("task", ["state", "pixels"])
-def test_training_goes_on_as_if_it_had_never_stopped(task: str, tmp_path: Path) -> None:
+def test_resumed_training_equals_uninterrupted_training(task: str, tmp_path: Path) -> None:
     expected = model_of(task).learn(STEPS)
 
     interrupted = model_of(task)
@@ -73,10 +74,10 @@ def test_training_goes_on_as_if_it_had_never_stopped(task: str, tmp_path: Path) 
     np.testing.assert_array_equal(model.env.reset(), expected.env.reset())
 
 
-def test_a_monitor_file_has_each_episode_once(tmp_path: Path) -> None:
+def test_a_monitor_file_lists_each_episode_once(tmp_path: Path) -> None:
     def model(folder: Path) -> BisimSAC:
         venv = make_vec_env("robust_bisim/SparseCartPole-v0", 1, seed=3, monitor_dir=str(folder))
-        return BisimSAC("MlpPolicy", venv, **LEARNING)
+        return make_model(env=venv, **LEARNING)
 
     def episodes(folder: Path) -> list[tuple[str, ...]]:
         return [tuple(line.split(",")[:2]) for line in (folder / "0.monitor.csv").read_text().splitlines()[1:]]
@@ -87,7 +88,7 @@ def test_a_monitor_file_has_each_episode_once(tmp_path: Path) -> None:
     interrupted = episodes(tmp_path / "b")
     assert len(interrupted) < len(episodes(tmp_path / "a"))
     continued, _ = load_checkpoint(path)
-    assert episodes(tmp_path / "b") == interrupted  # to load changes nothing
+    assert episodes(tmp_path / "b") == interrupted  # loading changes nothing
     save_checkpoint(path, continued)  # before another episode has ended
     for stop in (105, STEPS):
         continued, _ = load_checkpoint(path)
@@ -107,11 +108,11 @@ def test_a_monitor_file_has_each_episode_once(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_environments_that_cannot_be_kept_are_refused_at_the_start(
+def test_environments_that_cannot_be_saved_are_refused_at_the_start(
     env: str, venv_class: type[VecEnv], message: str, tmp_path: Path
 ) -> None:
     venv = make_vec_env(env, 1, vec_env_cls=venv_class)
-    model = BisimSAC("MlpPolicy", venv, **LEARNING)
+    model = make_model(env=venv, **LEARNING)
     with pytest.raises(ValueError, match=message):
         model.learn(30, callback=Checkpoint(tmp_path / "checkpoint.pkl", 100))
     with pytest.raises(ValueError, match=message):
@@ -120,11 +121,11 @@ def test_environments_that_cannot_be_kept_are_refused_at_the_start(
     venv.close()
 
 
-def test_hindsight_replay_goes_on_as_well(tmp_path: Path) -> None:
+def test_resumed_training_with_hindsight_replay_equals_uninterrupted_training(tmp_path: Path) -> None:
     def model() -> BisimSAC:
         env = BitFlippingEnv(n_bits=4, continuous=True)
-        settings = {**LEARNING, "intrinsic_reward_scale": 0.0, "replay_buffer_class": HerReplayBuffer}
-        return BisimSAC("MultiInputPolicy", env, **settings)
+        settings = dict(intrinsic_reward_scale=0.0, replay_buffer_class=HerReplayBuffer)
+        return make_model("MultiInputPolicy", env, **LEARNING, **settings)
 
     expected = model().learn(60)
     model().learn(60, callback=CallbackList([Checkpoint(tmp_path / "checkpoint.pkl", 30), StopAt(40)]))
@@ -134,7 +135,7 @@ def test_hindsight_replay_goes_on_as_well(tmp_path: Path) -> None:
         assert th.equal(tensor, continued.policy.state_dict()[name]), name
 
 
-def test_what_a_kill_has_left_is_written_over(tmp_path: Path) -> None:
+def test_a_half_written_checkpoint_is_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.pkl"
     script = f"""
 import os, signal
@@ -145,12 +146,12 @@ with atomic_path({str(path)!r}, alone=True) as temporary:
 """
     assert subprocess.run([sys.executable, "-c", script], timeout=300).returncode == -signal.SIGKILL
     assert len(list(tmp_path.iterdir())) == 1
-    save_checkpoint(path, BisimSAC("MlpPolicy", "Pendulum-v1", **LEARNING))
+    save_checkpoint(path, make_model(**LEARNING))
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pkl"]
     assert read_about(path)["num_timesteps"] == 0
 
 
-def test_two_writers_of_one_file_do_not_meet(tmp_path: Path) -> None:
+def test_two_writers_of_one_file_do_not_mix(tmp_path: Path) -> None:
     with atomic_path(tmp_path / "clip.raw") as first, atomic_path(tmp_path / "clip.raw") as second:
         first.write_text("first")
         second.write_text("second")
@@ -158,14 +159,14 @@ def test_two_writers_of_one_file_do_not_meet(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_a_checkpoint_needs_steps_in_between() -> None:
+def test_an_interval_of_no_steps_between_checkpoints_is_refused() -> None:
     with pytest.raises(ValueError, match="every=0"):
         Checkpoint("checkpoint.pkl", 0)
 
 
 @pytest.fixture
 def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """A run of the command line that is cut off before it saves its agent, and leaves a checkpoint at step 50."""
+    """The arguments of a run that is cut off before it saves its agent. It leaves a checkpoint at step 50."""
     monkeypatch.setattr(zoo.BisimExperimentManager, "save_trained_model", lambda *_: None)
     common = [
         *("train", "--env", "robust_bisim/SparseCartPole-v0", "--eval-freq", "-1", "--verbose", "0", "--n-timesteps", "60"),
@@ -195,7 +196,7 @@ def test_the_command_line_refuses_the_checkpoint_of_another_run(
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
-def test_an_entry_with_another_evaluation_is_another_run(command: list[str], tmp_path: Path) -> None:
+def test_a_checkpoint_is_refused_if_the_config_evaluates_differently(command: list[str], tmp_path: Path) -> None:
     config = yaml.safe_load(zoo.DEFAULT_CONFIG.read_text())
     config["robust_bisim/SparseCartPole-v0"]["eval_env_kwargs"] = {"theta_rew_fraction": 0.5}
     (tmp_path / "other.yml").write_text(yaml.dump(config))
@@ -203,21 +204,21 @@ def test_an_entry_with_another_evaluation_is_another_run(command: list[str], tmp
         zoo.main([*command, "--seed", "3", "-conf", str(tmp_path / "other.yml")])
 
 
-def test_a_run_that_goes_on_may_become_longer(command: list[str], capsys: pytest.CaptureFixture) -> None:
+def test_a_resumed_run_may_be_longer(command: list[str], capsys: pytest.CaptureFixture) -> None:
     zoo.main([*command, "--seed", "3", "--n-timesteps", "80"])
     assert "Going on from step 50" in capsys.readouterr().out
 
 
-def test_a_checkpoint_of_other_versions_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_checkpoint_from_other_package_versions_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sb3_robust_bisim.runs.checkpoint._versions", lambda: {"torch": "1.0"})
-    save_checkpoint(tmp_path / "checkpoint.pkl", BisimSAC("MlpPolicy", "Pendulum-v1", **LEARNING))
+    save_checkpoint(tmp_path / "checkpoint.pkl", make_model(**LEARNING))
     monkeypatch.undo()
     with pytest.raises(ValueError, match=r"needs the versions that it was written with: .*torch is 1\.0 there and 2"):
         load_checkpoint(tmp_path / "checkpoint.pkl")
 
 
-def test_a_checkpoint_of_a_gpu_that_is_not_here_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    save_checkpoint(tmp_path / "checkpoint.pkl", BisimSAC("MlpPolicy", "Pendulum-v1", **LEARNING), about={"name": "a"})
+def test_a_checkpoint_from_a_machine_with_more_gpus_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save_checkpoint(tmp_path / "checkpoint.pkl", make_model(**LEARNING), about={"name": "a"})
     assert read_about(tmp_path / "checkpoint.pkl")["gpus"] == 0
     with (tmp_path / "checkpoint.pkl").open("rb") as file:
         header, rest = pickle.load(file), file.read()
@@ -226,7 +227,7 @@ def test_a_checkpoint_of_a_gpu_that_is_not_here_is_refused(tmp_path: Path, monke
         load_checkpoint(tmp_path / "elsewhere.pkl")
 
 
-def test_another_file_is_refused_by_name(command: list[str], tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_checkpoint_is_refused_by_name(command: list[str], tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.pkl"
     path.write_bytes(b"PK\x03\x04 a model, say")
     with pytest.raises(ValueError, match=r"checkpoint\.pkl: this is no checkpoint. Name another file"):
@@ -234,13 +235,13 @@ def test_another_file_is_refused_by_name(command: list[str], tmp_path: Path) -> 
     path.write_bytes(pickle.dumps([1, 2]))
     with pytest.raises(ValueError, match=r"checkpoint\.pkl: this is no checkpoint, but some other pickle"):
         zoo.main([*command, "--seed", "3"])
-    save_checkpoint(path, BisimSAC("MlpPolicy", "Pendulum-v1", **LEARNING))
+    save_checkpoint(path, make_model(**LEARNING))
     with pytest.raises(ValueError, match=r"--checkpoint .*checkpoint\.pkl: saved from Python, not by this command"):
         zoo.main([*command, "--seed", "3"])
 
 
-def test_training_goes_on_although_a_logger_had_been_set(tmp_path: Path) -> None:
-    model = BisimSAC("MlpPolicy", "Pendulum-v1", **LEARNING)
+def test_training_resumes_if_the_user_had_set_a_logger(tmp_path: Path) -> None:
+    model = make_model(**LEARNING)
     model.set_logger(configure(str(tmp_path), ["csv"]))
     model.learn(40, callback=Checkpoint(tmp_path / "checkpoint.pkl", 30))
     assert load_checkpoint(tmp_path / "checkpoint.pkl")[0].learn(10, reset_num_timesteps=False).num_timesteps == 40

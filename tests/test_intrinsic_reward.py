@@ -1,4 +1,4 @@
-"""The bonus wrapper: real transitions, terminal ones included, under every wrapper that it may meet."""
+"""The bonus is computed from true transitions, even at the end of an episode and among other wrappers."""
 
 from typing import Any
 
@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from small_models import images, layers, make_model
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
@@ -24,11 +24,11 @@ from stable_baselines3.common.vec_env import (
 from sb3_robust_bisim import BisimSAC, IntrinsicRewardVecEnv
 
 ENV = "robust_bisim/SparsePendulum-v0"
-SMALL: dict[str, Any] = dict(learning_starts=10, batch_size=8, seed=0, policy_kwargs=dict(net_arch=[16]))
+SATURATED = dict(intrinsic_reward_scale=1e6, intrinsic_reward_max=0.5)  # every bonus is 0.5
 
 
 class Countdown(gym.Env):
-    """Episodes of three steps whose observation tells the episode and the step, with actions in [-2, 2]."""
+    """Episodes of three steps with actions in [-2, 2]. The observation holds the numbers of the episode and the step."""
 
     observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
     action_space = spaces.Box(-2, 2, (1,), np.float32)
@@ -71,25 +71,25 @@ def test_the_bonus_sees_the_true_successor_also_at_the_end_of_an_episode(as_dict
     assert seen == transitions
 
 
-def test_the_stored_reward_is_reward_plus_the_formula_for_every_transition() -> None:
+def test_every_stored_reward_is_the_reward_plus_the_formula() -> None:
     arguments = dict(intrinsic_reward_scale=0.1, intrinsic_reward_max=0.03, learning_starts=100)
-    model = BisimSAC("MlpPolicy", DummyVecEnv([Countdown, Countdown]), **{**SMALL, **arguments})
+    model = make_model(env=DummyVecEnv([Countdown, Countdown]), **arguments)
     model.learn(18)  # random actions only: the models stay as they were built
     buffer = model.replay_buffer
     for step in range(9):
         obs, next_obs = (th.as_tensor(array[step]) for array in (buffer.observations, buffer.next_observations))
-        assert next_obs[:, 1].tolist() == (obs[:, 1] + 1).tolist()  # the terminal transition too leads to its own episode
+        assert next_obs[:, 1].tolist() == (obs[:, 1] + 1).tolist()  # even the terminal transition stays within its episode
         with th.no_grad():
             z, next_z = model.critic.features_extractor.encode(obs), model.critic.features_extractor.encode(next_obs)
             mean = model.policy.representation.dynamics(z, th.as_tensor(buffer.actions[step])).mean[0]
         n = z.shape[1]
         expected = np.minimum(0.03, 0.1 * ((mean - next_z) ** 2).sum(dim=1).numpy() / (2 * n))
         np.testing.assert_allclose(buffer.rewards[step], 5.0 + expected, rtol=1e-5)
-    assert 0 < (buffer.rewards[:9] == np.float32(5.03)).mean() < 1  # the clamp bites, and not always
+    assert 0 < (buffer.rewards[:9] == np.float32(5.03)).mean() < 1  # some bonuses are clamped and some are not
 
 
-def test_actions_are_scaled_to_what_the_buffer_holds() -> None:
-    model = BisimSAC("MlpPolicy", DummyVecEnv([Countdown]), intrinsic_reward_scale=1.0, **SMALL).learn(1)
+def test_the_bonus_scales_actions_as_the_buffer_does() -> None:
+    model = make_model(env=DummyVecEnv([Countdown])).learn(1)
     obs = np.array([[1.0, 0.0]], dtype=np.float32)
     seen = []
     model.policy.representation.dynamics.register_forward_hook(lambda module, inputs, output: seen.append(inputs[1].item()))
@@ -98,7 +98,7 @@ def test_actions_are_scaled_to_what_the_buffer_holds() -> None:
     assert seen == [1.0, -0.5]
 
 
-def test_unbound_it_passes_everything_through() -> None:
+def test_an_unbound_wrapper_passes_everything_through() -> None:
     plain, wrapped = make_vec_env(ENV, 2, seed=3), IntrinsicRewardVecEnv(make_vec_env(ENV, 2, seed=3))
     np.testing.assert_array_equal(plain.reset(), wrapped.reset())
     for _ in range(210):
@@ -108,48 +108,44 @@ def test_unbound_it_passes_everything_through() -> None:
     assert "intrinsic_reward" not in wrapped.step(actions)[3][0]
 
 
-def chain(env: VecEnv | None) -> list[str]:
-    names = []
-    while env is not None:
-        names.append(type(env).__name__)
-        env = getattr(env, "venv", None)
-    return names
+def layer_names(model: BisimSAC) -> list[str]:
+    return [type(layer).__name__ for layer in layers(model.get_env())]
 
 
-def test_it_is_added_once_and_survives_set_env_and_load(tmp_path: Any) -> None:
-    model = BisimSAC("MlpPolicy", ENV, intrinsic_reward_scale=1.0, **SMALL)
+def test_the_wrapper_is_added_once_and_survives_set_env_and_load(tmp_path: Any) -> None:
+    model = make_model(env=ENV)
     wrapped = ["IntrinsicRewardVecEnv", "DummyVecEnv"]
-    assert chain(model.get_env()) == wrapped
+    assert layer_names(model) == wrapped
     model.set_env(model.get_env())
-    assert chain(model.get_env()) == wrapped
+    assert layer_names(model) == wrapped
     model.set_env(gym.make(ENV))
-    assert chain(model.get_env()) == wrapped
+    assert layer_names(model) == wrapped
     model.learn(20)
     model.save(tmp_path / "m")
     for env in (gym.make(ENV), model.get_env()):
         loaded = BisimSAC.load(tmp_path / "m", env=env)
-        assert chain(loaded.get_env()) == wrapped
+        assert layer_names(loaded) == wrapped
         loaded.learn(5, reset_num_timesteps=False)
         assert "rollout/intrinsic_reward" in loaded.logger.name_to_value
     assert BisimSAC.load(tmp_path / "m").get_env() is None
 
 
-def test_a_model_without_bonus_learns_without_the_one_of_a_model_before_it() -> None:
-    env = BisimSAC("MlpPolicy", DummyVecEnv([Countdown]), intrinsic_reward_scale=1.0, **SMALL).get_env()
-    model = BisimSAC("MlpPolicy", env, **SMALL).learn(12)
+def test_a_model_without_bonus_ignores_the_bonus_of_an_earlier_model() -> None:
+    env = make_model(env=DummyVecEnv([Countdown])).get_env()
+    model = make_model(env=env, intrinsic_reward_scale=0.0).learn(12)
     assert model.replay_buffer.rewards[:12].tolist() == [[5.0]] * 12
 
 
-def test_each_model_learns_from_its_own_bonus_though_they_share_the_environments(tmp_path: Any) -> None:
-    model = BisimSAC("MlpPolicy", DummyVecEnv([Countdown]), intrinsic_reward_scale=1e6, intrinsic_reward_max=0.5, **SMALL)
+def test_models_that_share_environments_each_learn_from_their_own_bonus(tmp_path: Any) -> None:
+    model = make_model(env=DummyVecEnv([Countdown]), **SATURATED)
     model.learn(3)
-    without = BisimSAC("MlpPolicy", model.get_env(), **SMALL).learn(3)
+    without = make_model(env=model.get_env(), intrinsic_reward_scale=0.0).learn(3)
     model.learn(3, reset_num_timesteps=False)
     assert model.replay_buffer.rewards[:6].tolist() == [[5.5]] * 6
     assert without.replay_buffer.rewards[:3].tolist() == [[5.0]] * 3
 
 
-def test_a_vec_env_that_does_not_tell_where_an_episode_ended_is_taken_as_it_is() -> None:
+def test_a_vec_env_without_terminal_observations_trains() -> None:
     class Silent(VecEnvWrapper):
         def reset(self) -> np.ndarray:
             return self.venv.reset()
@@ -158,13 +154,13 @@ def test_a_vec_env_that_does_not_tell_where_an_episode_ended_is_taken_as_it_is()
             obs, rewards, dones, infos = self.venv.step_wait()
             return obs, rewards, dones, [{} for _ in infos]
 
-    model = BisimSAC("MlpPolicy", Silent(DummyVecEnv([Countdown])), intrinsic_reward_scale=1.0, **SMALL)
+    model = make_model(env=Silent(DummyVecEnv([Countdown])))
     assert model.learn(30).num_timesteps == 30
 
 
-def test_under_vecnormalize_it_reads_normalised_observations_and_reaches_the_buffer() -> None:
+def test_the_bonus_reads_normalised_observations_under_vecnormalize_and_reaches_the_buffer() -> None:
     venv = VecNormalize(IntrinsicRewardVecEnv(DummyVecEnv([Countdown])), norm_reward=False)
-    model = BisimSAC("MlpPolicy", venv, intrinsic_reward_scale=1e6, intrinsic_reward_max=0.5, **SMALL)
+    model = make_model(env=venv, **SATURATED)
     encoded = []
     model.critic.features_extractor.register_forward_pre_hook(lambda module, inputs: encoded.append(inputs[0].clone()))
     model.learn(9)
@@ -176,16 +172,11 @@ def test_under_vecnormalize_it_reads_normalised_observations_and_reaches_the_buf
         assert not np.allclose(seen, obs)
 
 
-def test_frame_stacks_below_it_are_seen_whole() -> None:
-    def make_env() -> gym.Env:
-        return FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False)
-
-    stack = VecFrameStack(DummyVecEnv([make_env]), 3)
-    model = BisimSAC("CnnPolicy", stack, intrinsic_reward_scale=1.0, buffer_size=50, **SMALL).learn(20)
-    assert chain(model.get_env())[0] == "IntrinsicRewardVecEnv"
-    inside = VecFrameStack(IntrinsicRewardVecEnv(DummyVecEnv([make_env])), 3)
+def test_the_wrapper_must_see_whole_frame_stacks() -> None:
+    model = make_model("CnnPolicy", VecFrameStack(DummyVecEnv([images]), 3)).learn(20)
+    assert layer_names(model)[0] == "IntrinsicRewardVecEnv"
     with pytest.raises(ValueError, match="VecFrameStack"):
-        BisimSAC("CnnPolicy", inside, intrinsic_reward_scale=1.0, buffer_size=50, **SMALL)
+        make_model("CnnPolicy", VecFrameStack(IntrinsicRewardVecEnv(DummyVecEnv([images])), 3))
 
 
 class OneArray(VecEnvWrapper):
@@ -201,19 +192,21 @@ class OneArray(VecEnvWrapper):
 
 
 def test_a_vec_env_that_reuses_its_array_gets_the_same_bonuses() -> None:
-    settings = {**SMALL, "intrinsic_reward_scale": 1.0, "intrinsic_reward_max": 1e9}  # never clamped
     rewards = []
     for reuse in (False, True):
         venv: VecEnv = DummyVecEnv([Countdown] * 2)
-        model = BisimSAC("MlpPolicy", OneArray(venv) if reuse else venv, **{**settings, "gradient_steps": 0}).learn(30)
+        env = OneArray(venv) if reuse else venv
+        model = make_model(env=env, intrinsic_reward_max=1e9, gradient_steps=0).learn(30)  # no bonus is clamped
         rewards.append(model.replay_buffer.rewards[: model.replay_buffer.pos])
     assert len(np.unique(rewards[0])) > 2
     np.testing.assert_array_equal(*rewards)
 
 
-def test_it_is_bound_while_learn_runs_and_then_no_more() -> None:
-    model = BisimSAC("MlpPolicy", DummyVecEnv([Countdown]), intrinsic_reward_scale=1.0, **SMALL)
+def test_the_bonus_is_bound_only_while_learn_runs_even_if_it_fails() -> None:
+    model = make_model(env=DummyVecEnv([Countdown]))
     venv = model.get_env()
+    venv.reset()
+    assert "intrinsic_reward" not in venv.step(np.zeros((1, 1)))[3][0]
 
     class Fail(BaseCallback):
         def _on_step(self) -> bool:
@@ -225,17 +218,23 @@ def test_it_is_bound_while_learn_runs_and_then_no_more() -> None:
     assert "intrinsic_reward" not in venv.step(np.zeros((1, 1)))[3][0]
 
 
-def test_it_works_with_environments_in_other_processes() -> None:
+def test_the_bonus_works_with_environments_in_other_processes() -> None:
     venv = SubprocVecEnv([Countdown, Countdown], start_method="forkserver")
-    model = BisimSAC("MlpPolicy", venv, intrinsic_reward_scale=1e6, intrinsic_reward_max=0.5, **SMALL).learn(24)
+    model = make_model(env=venv, **SATURATED).learn(24)
     np.testing.assert_allclose(model.replay_buffer.rewards[:12], 5.5)
     venv.close()
 
 
+def test_evaluation_in_the_training_environments_sees_no_bonus_after_learn() -> None:
+    # without a Monitor, which would report the reward below the bonus in any case
+    model = make_model(env=DummyVecEnv([Countdown]), **SATURATED).learn(12)
+    assert model.replay_buffer.rewards[:12].tolist() == [[5.5]] * 12
+    returns, _ = evaluate_policy(model, model.get_env(), n_eval_episodes=2, warn=False, return_episode_rewards=True)
+    assert returns == [15.0, 15.0]
+
+
 def test_evaluation_and_monitor_show_the_extrinsic_return() -> None:
-    model = BisimSAC(
-        "MlpPolicy", make_vec_env(Countdown, 1), intrinsic_reward_scale=1e6, intrinsic_reward_max=0.5, **SMALL
-    ).learn(12)
+    model = make_model(env=make_vec_env(Countdown, 1), **SATURATED).learn(12)
     assert {episode["r"] for episode in model.ep_info_buffer} == {15.0}
     assert evaluate_policy(model, model.get_env(), n_eval_episodes=2)[0] == 15.0
     assert is_vecenv_wrapped(model.get_env(), IntrinsicRewardVecEnv)

@@ -1,4 +1,6 @@
-"""The mathematics: each loss against an independent computation."""
+"""Each loss agrees with an independent computation."""
+
+from pathlib import Path
 
 import numpy as np
 import ot
@@ -6,9 +8,11 @@ import pytest
 import torch as th
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_models import EPISODE, events, make_model, parameters, pendulum
 
 from sb3_robust_bisim import losses
-from sb3_robust_bisim.latent_models import DynamicsModel
+from sb3_robust_bisim.callbacks import ValueBoundCallback
+from sb3_robust_bisim.latent_models import DYNAMICS, DynamicsModel
 
 SETTINGS = settings(max_examples=50, deadline=None, derandomize=True)
 
@@ -19,7 +23,7 @@ def normal(*shape: int, seed: int = 0) -> th.Tensor:
 
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 12))
 @SETTINGS
-def test_w2_of_diagonal_gaussians_is_the_optimal_transport_of_pot(seed: int, n: int) -> None:
+def test_w2_of_diagonal_gaussians_agrees_with_the_optimal_transport_of_pot(seed: int, n: int) -> None:
     mean_i, mean_j, raw_i, raw_j = normal(4, n, seed=seed)
     std_i, std_j = raw_i.exp(), raw_j.exp()
     expected = ot.gaussian.bures_wasserstein_distance(mean_i, mean_j, th.diag(std_i**2), th.diag(std_j**2))
@@ -28,7 +32,7 @@ def test_w2_of_diagonal_gaussians_is_the_optimal_transport_of_pot(seed: int, n: 
     assert distance.item() == pytest.approx(float(expected), rel=1e-6, abs=1e-6)
 
 
-def test_w2_of_each_coordinate_is_that_of_one_dimensional_gaussians() -> None:
+def test_w2_of_each_coordinate_agrees_with_that_of_one_dimensional_gaussians() -> None:
     mean_i, mean_j, raw_i, raw_j = normal(4, 5)
     std_i, std_j = raw_i.exp(), raw_j.exp()
     expected = [
@@ -42,7 +46,7 @@ def test_w2_of_each_coordinate_is_that_of_one_dimensional_gaussians() -> None:
     assert losses.pairwise_distance(*means, "l1", *stds).item() == pytest.approx(sum(expected))
 
 
-def test_w2_of_equal_spreads_is_the_distance_of_the_means() -> None:
+def test_w2_of_gaussians_of_equal_spread_is_the_distance_of_the_means() -> None:
     mean_i, mean_j, std = normal(3, 4, 6)
     for distance in ("l1", "l2"):
         w2 = losses.pairwise_distance(mean_i, mean_j, distance, std.exp(), std.exp())
@@ -58,7 +62,7 @@ def test_huber_is_elementwise_and_the_norms_reduce_the_embedding() -> None:
 
 @given(seed=st.integers(0, 2**32 - 1), radius=st.floats(0.1, 100), scale=st.floats(0.01, 1000))
 @SETTINGS
-def test_projection_ends_in_the_ball_keeps_directions_and_leaves_the_interior_alone(
+def test_the_projection_ends_in_the_ball_and_keeps_directions_and_interior_points(
     seed: int, radius: float, scale: float
 ) -> None:
     x = (scale * normal(20, 7, seed=seed)).float()
@@ -71,19 +75,41 @@ def test_projection_ends_in_the_ball_keeps_directions_and_leaves_the_interior_al
     assert th.equal(losses.project_to_ball(x, None), x)
 
 
-def test_what_would_be_taken_for_something_else_is_refused() -> None:
+def test_names_and_radii_without_a_meaning_are_refused() -> None:
     x = th.ones(2, 3)
     with pytest.raises(ValueError, match=r"radius=-1\.0"):
         losses.project_to_ball(x, -1.0)
-    with pytest.raises(ValueError, match="distance='cosine'"):
-        losses.pairwise_distance(x, x, "cosine")
-    with pytest.raises(ValueError, match="distance='cosine'"):
-        losses.pairwise_distance(x, x, "cosine", x, x)
+    with pytest.raises(ValueError, match="distance='chebyshev'"):
+        losses.pairwise_distance(x, x, "chebyshev")
+    with pytest.raises(ValueError, match="distance='chebyshev'"):
+        losses.pairwise_distance(x, x, "chebyshev", x, x)
     with pytest.raises(ValueError, match="kind='gaussian'"):
         DynamicsModel(3, 1, "gaussian", None)
 
 
-def test_what_was_outside_is_told_from_what_was_inside() -> None:
+@pytest.mark.parametrize("dynamics", DYNAMICS)
+def test_a_distance_works_everywhere_once_distances_holds_its_function(
+    dynamics: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The new distance is half of l2, so a result of any other function would have the wrong ratio to that of l2."""
+    monkeypatch.setitem(losses.DISTANCES, "half of l2", lambda *args: losses.l2(*args) / 2)
+    found = []
+    for distance in ("l2", "half of l2"):
+        folder = tmp_path / distance
+        # no reward and no bonus: the metric loss compares distances of embeddings alone
+        settings = dict(distance=distance, dynamics=dynamics, intrinsic_reward_scale=0.0, tensorboard_log=str(folder))
+        model = make_model(env=pendulum(reward=0.0), **settings)
+        model.learn(EPISODE, callback=ValueBoundCallback(n_states=20))  # no update yet, so both models embed alike
+        model.logger.close()
+        model.train(gradient_steps=1, batch_size=8)
+        logged = model.logger.name_to_value
+        assert th.isfinite(parameters(model.policy)).all()
+        bound = events(folder).Scalars("bisim/value_bound")[0].value
+        found.append([bound, logged["bisim/mu_bd"], logged["train/bisim_loss"]])
+    np.testing.assert_allclose(np.array(found[1]) / found[0], [0.5, 0.5, 0.25], rtol=1e-5)
+
+
+def test_on_surface_picks_exactly_the_vectors_that_were_outside() -> None:
     x = th.stack([scale * th.nn.functional.normalize(th.randn(50), dim=0) for scale in (1e-3, 0.99, 0.9999, 1.01, 2.0, 1e3)])
     norm = losses.project_to_ball(7.0 * x, 7.0).norm(dim=1)
     assert losses.on_surface(norm, 7.0).tolist() == [False, False, False, True, True, True]
@@ -105,50 +131,7 @@ def test_the_radius_follows_from_c_r_c_t_and_the_reward_range(
     assert losses.ball_radius(c_r, c_t, reward_range) == pytest.approx(radius)
 
 
-@pytest.mark.parametrize("distance", losses.DISTANCES)
-@pytest.mark.parametrize("gaussian", [False, True])
-def test_metric_loss_is_the_papers_formula_written_as_loops(distance: str, gaussian: bool) -> None:
-    z, mean, raw = normal(3, 6, 4)
-    rewards, std = normal(6, 1, seed=1), raw.exp() if gaussian else None
-    pairs, c_r, c_t = th.tensor([3, 0, 5, 1, 2, 4]), 0.7, 0.9
-
-    def d(x: float) -> float:
-        return (0.5 * x**2 if abs(x) < 1 else abs(x) - 0.5) if distance == "huber" else abs(x)
-
-    def norm(x: list[float]) -> float:
-        return float(np.sqrt(np.square(x).sum()) if distance == "l2" else np.sum(x))
-
-    terms = []
-    for i, j in enumerate(pairs.tolist()):
-        reward_gap = d(float(rewards[i] - rewards[j]))
-        z_gaps = [d(float(x)) for x in z[i] - z[j]]
-        if std is None:
-            transition_gaps = [d(float(x)) for x in mean[i] - mean[j]]
-        else:
-            squares = (mean[i] - mean[j]) ** 2 + (std[i] - std[j]) ** 2
-            transition_gaps = [float(x) ** 0.5 for x in squares]
-        if distance == "huber":
-            terms += [(a - c_r * reward_gap - c_t * b) ** 2 for a, b in zip(z_gaps, transition_gaps, strict=True)]
-        else:
-            terms.append((norm(z_gaps) - c_r * reward_gap - c_t * norm(transition_gaps)) ** 2)
-    loss, mu_bd, mu_rd = losses.bisim_loss(z, rewards, mean, std, pairs, c_r, c_t, distance)
-    assert loss.item() == pytest.approx(np.mean(terms))
-    assert mu_bd.item() == pytest.approx(losses.pairwise_distance(z, z[pairs], distance).mean().item())
-    assert mu_rd.item() == pytest.approx(np.mean([d(float(rewards[i] - rewards[j])) for i, j in enumerate(pairs)]))
-
-
-@pytest.mark.parametrize("distance", losses.DISTANCES)
-def test_the_target_of_the_metric_loss_carries_no_gradient(distance: str) -> None:
-    z, rewards, mean, std = (normal(8, n, seed=n).requires_grad_() for n in (4, 1, 4, 4))
-    loss, *_ = losses.bisim_loss(z, rewards, mean, std.exp(), th.randperm(8), 1.0, 0.99, distance)
-    loss.backward()
-    assert z.grad.abs().sum() > 0
-    assert rewards.grad is None
-    assert mean.grad is None
-    assert std.grad is None
-
-
-def test_dynamics_loss_is_the_gaussian_log_likelihood_and_leaves_its_target_alone() -> None:
+def test_the_dynamics_loss_is_the_gaussian_log_likelihood_and_sends_no_gradient_to_its_target() -> None:
     mean, raw = normal(2, 3, 5, 4)
     target = normal(5, 4, seed=2).requires_grad_()
     expected = -th.distributions.Normal(mean, raw.exp()).log_prob(target).mean() - 0.5 * np.log(2 * np.pi)
@@ -161,7 +144,25 @@ def test_dynamics_loss_is_the_gaussian_log_likelihood_and_leaves_its_target_alon
     assert target.grad is None
 
 
-def test_inverse_dynamics_loss_is_the_l1_distance_per_action_dimension() -> None:
+def test_beta_nll_weights_each_coordinate_by_its_spread() -> None:
+    mean, raw = normal(2, 3, 5, 4)
+    target, std = normal(5, 4, seed=2), raw.exp().requires_grad_()
+    loss = losses.dynamics_loss(mean, std, target, beta=0.5)
+    expected = (std.detach() * (0.5 * ((mean - target) / std.detach()).square() + std.detach().log())).mean()
+    assert loss.item() == pytest.approx(expected.item())
+    loss.backward()
+    # the weight carries no gradient: sigma's is that of the likelihood, weighted
+    th.testing.assert_close(std.grad, (1 - ((mean - target) / std.detach()).square()) / std.numel())
+
+
+def test_a_gaussian_reward_is_judged_by_its_likelihood() -> None:
+    mean, raw, rewards = normal(3, 6, 1)
+    expected = -th.distributions.Normal(mean, raw.exp()).log_prob(rewards).mean() - 0.5 * np.log(2 * np.pi)
+    assert losses.reward_loss(mean, raw.exp(), rewards).item() == pytest.approx(expected.item())
+    assert losses.reward_loss(mean, None, rewards).item() == pytest.approx((mean - rewards).square().mean().item())
+
+
+def test_the_inverse_dynamics_loss_is_the_l1_distance_per_action_dimension() -> None:
     predicted, actions = th.tensor([[0.5, -1.0], [0.0, 0.0]]), th.tensor([[0.0, 1.0], [0.0, 1.0]])
     assert losses.inverse_dynamics_loss(predicted, actions).item() == pytest.approx((2.5 / 2 + 1 / 2) / 2)
 

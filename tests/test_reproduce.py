@@ -1,4 +1,4 @@
-"""The sweep that repeats the paper's figures, with real processes that are really killed."""
+"""The sweep that repeats the paper's figures runs in real processes and survives real kills."""
 
 import json
 import os
@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-pytestmark = pytest.mark.xdist_group("sweeps")  # they share the local one, and both cores
+pytestmark = pytest.mark.xdist_group("sweeps")  # they share the local sweep and use both cores
 
 ROOT = Path(__file__).parent.parent
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
@@ -52,7 +52,7 @@ def started(*arguments: str) -> Iterator[subprocess.Popen]:
 
 @contextmanager
 def dask_cluster() -> Iterator[tuple[str, list[subprocess.Popen]]]:
-    """A scheduler and two workers, each a process of its own."""
+    """A scheduler and two workers in three separate processes."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{probe.getsockname()[1]}"
@@ -84,11 +84,11 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_sweep_on_dask_survives_the_death_of_a_worker_and_gives_the_numbers_of_a_local_one(local, tmp_path) -> None:
+def test_a_sweep_on_dask_survives_a_killed_worker_and_gives_the_same_numbers_as_a_local_sweep(local, tmp_path) -> None:
     with dask_cluster() as (address, workers):
         arguments = command(tmp_path, *SWEEP, "--backend", "dask", "--scheduler", address)
         with subprocess.Popen(arguments, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-            # both workers are in the middle of a run, with something to go on from
+            # both workers are in the middle of a run and have written a checkpoint
             wait_until(lambda: len(list(tmp_path.glob("work/*/*/checkpoint.pkl"))) == 2, process)
             workers[0].send_signal(signal.SIGKILL)
             assert process.wait(timeout=600) == 0
@@ -102,7 +102,7 @@ def test_a_sweep_on_dask_survives_the_death_of_a_worker_and_gives_the_numbers_of
     assert all(log.count("Saving to") == 1 for log in logs)
 
 
-def test_a_sweep_goes_on_from_where_it_was_killed_and_ends_with_the_same_numbers(local, tmp_path) -> None:
+def test_a_killed_sweep_resumes_and_ends_with_the_same_numbers(local, tmp_path) -> None:
     arguments = command(tmp_path, *SWEEP, "--jobs", "2")
     with subprocess.Popen(arguments, env=ENVIRONMENT, stderr=subprocess.DEVNULL, start_new_session=True) as process:
         wait_until(lambda: results(tmp_path) and list(tmp_path.glob("work/*/*/checkpoint.pkl")), process)
@@ -117,13 +117,13 @@ def test_a_sweep_goes_on_from_where_it_was_killed_and_ends_with_the_same_numbers
     assert any("Going on from step" in path.read_text() for path in tmp_path.glob("work/*/*/log.txt"))
 
 
-def test_a_finished_sweep_has_curves_a_csv_and_a_table_and_nothing_left_to_do(local) -> None:
+def test_a_finished_sweep_has_curves_a_csv_a_table_and_no_runs_left(local) -> None:
     (folder,) = (local / "results").iterdir()
     assert folder.name == "cartpole_400steps_every100_batch_size=32_initial_gradient_steps=20_learning_starts=100"
     assert (folder / "curves.png").read_bytes().startswith(b"\x89PNG")
     curves = (folder / "curves.csv").read_text()
     assert "mean_return,N_m=2,normed-IR-ID,3,400," in curves
-    assert "iqm_return" not in curves  # of three runs it would be the mean
+    assert "iqm_return" not in curves  # for three runs it would equal the mean
     assert "| N_m=2 | normed-IR-ID | 3 |" in (folder / "table.md").read_text()
     process = reproduce(local, *SWEEP, "--dry-run")
     assert process.stdout == ""
@@ -140,7 +140,7 @@ def test_a_dry_run_shows_the_commands_and_the_time_and_runs_nothing(tmp_path) ->
     assert "0 of 6 runs have ended; the rest takes" in process.stderr
 
 
-def test_a_run_that_two_figures_share_is_run_once(tmp_path) -> None:
+def test_a_run_shared_by_two_figures_is_run_once(tmp_path) -> None:
     recorded = sorted(ROOT.glob("benchmarks/results/cartpole/N_m2_DBC_seed*.json"))
     (tmp_path / "results" / "cartpole").mkdir(parents=True)
     for path in recorded:
@@ -157,7 +157,7 @@ def test_results_of_another_configuration_are_refused(tmp_path) -> None:
     recorded = json.loads((ROOT / "benchmarks/results/cartpole/N_m2_SAC_seed0.json").read_text())
     path = tmp_path / "results" / "cartpole" / "N_m2_SAC_seed0.json"
     path.parent.mkdir(parents=True)
-    recorded["arguments"]["intrinsic_reward_max"] = 0.1  # to state a default changes nothing
+    recorded["arguments"]["intrinsic_reward_max"] = 0.1  # stating a default changes nothing
     path.write_text(json.dumps(recorded))
     assert reproduce(tmp_path, "cartpole", "--dry-run").returncode == 0
     recorded["arguments"]["batch_size"] = 64
@@ -181,7 +181,7 @@ def test_no_run_waits_for_another_seed_of_its_method(tmp_path, monkeypatch: pyte
     assert len(list(tmp_path.glob("work/*.lock"))) == 2
 
 
-def test_a_run_that_broke_off_does_not_hide_the_others(tmp_path) -> None:
+def test_a_run_that_broke_off_does_not_hide_the_other_runs(tmp_path) -> None:
     shutil.copytree(ROOT / "benchmarks/results/dmc_pixels", tmp_path / "results/dmc_pixels")
     path = tmp_path / "results/dmc_pixels/video_SAC_seed0.json"
     recorded = json.loads(path.read_text())

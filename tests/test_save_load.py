@@ -1,4 +1,4 @@
-"""What BisimSAC saves comes back whole: nets, optimizers, counters, bonus and replay buffer, also in another process."""
+"""Saving and loading restores nets, optimizers, counters, bonus and replay buffer, even in another process."""
 
 import io
 import json
@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
-from small_models import SMALL, pendulum
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecNormalize
+from small_models import layers, make_model, pendulum
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_robust_bisim import BisimSAC, IntrinsicRewardVecEnv
 from sb3_robust_bisim.policies import MlpPolicy
@@ -28,14 +28,10 @@ STATE_DICTS = {
 }
 
 
-def make_model(**kwargs: Any) -> Any:
-    return BisimSAC("MlpPolicy", **{"env": pendulum(), **SMALL, "initial_gradient_steps": 3, **kwargs})
-
-
 @pytest.fixture(scope="module")
 def trained() -> Any:
-    """A model after 10 random steps and 3 + 4 updates; not to be changed."""
-    return make_model().learn(15)
+    """A model after 10 random steps and 3 + 4 updates. Tests must not change it."""
+    return make_model(initial_gradient_steps=3).learn(15)
 
 
 @pytest.fixture
@@ -49,16 +45,11 @@ def actions_of(model: Any) -> np.ndarray:
 
 
 def bonus_layers(model: Any) -> list[IntrinsicRewardVecEnv]:
-    layers, layer = [], model.get_env()
-    while isinstance(layer, VecEnvWrapper):
-        if isinstance(layer, IntrinsicRewardVecEnv):
-            layers.append(layer)
-        layer = layer.venv
-    return layers
+    return [layer for layer in layers(model.get_env()) if isinstance(layer, IntrinsicRewardVecEnv)]
 
 
 def bonuses(model: Any, steps: int = 3) -> list[float | None]:
-    """What the environment pays beside the reward while the model learns, None where no bonus is bound."""
+    """The bonus of each step while the model learns. None stands for a step without a bonus."""
     paid: list[float | None] = []
 
     def note(found: dict[str, Any], _: dict[str, Any]) -> bool:
@@ -74,16 +65,16 @@ def assert_same(left: Any, right: Any) -> None:
 
 
 def without_text(state: Any) -> Any:
-    """A state dict as nested dicts and lists of numbers and tensors, which torch can compare."""
+    """A state dict as nested dicts and lists of numbers and tensors, because torch can compare those."""
     if isinstance(state, dict):
         return {str(key): without_text(value) for key, value in state.items() if value is not None}
     return [without_text(value) for value in state] if isinstance(state, (list, tuple)) else state
 
 
-def test_a_model_comes_back_with_all_nets_optimizers_and_counters(trained: Any, saved: Path) -> None:
+def test_load_restores_all_nets_optimizers_and_counters(trained: Any, saved: Path) -> None:
     assert set(trained.get_parameters()) == STATE_DICTS
     for optimizer in STATE_DICTS - {"policy"}:
-        assert trained.get_parameters()[optimizer]["state"]  # there is something to lose
+        assert trained.get_parameters()[optimizer]["state"]  # there is a state that could be lost
     loaded: Any = BisimSAC.load(saved)
     assert_same(without_text(loaded.get_parameters()), without_text(trained.get_parameters()))
     assert_same(loaded.log_ent_coef, trained.log_ent_coef)
@@ -93,19 +84,19 @@ def test_a_model_comes_back_with_all_nets_optimizers_and_counters(trained: Any, 
 
 
 @pytest.mark.parametrize("how", ["load(env)", "set_env", "load(bound env)"])
-def test_a_loaded_model_learns_on_with_one_bonus_and_no_second_burst(trained: Any, saved: Path, how: str) -> None:
+def test_a_loaded_model_continues_with_one_bonus_and_no_initial_gradient_steps(trained: Any, saved: Path, how: str) -> None:
     env = make_model().get_env() if how == "load(bound env)" else pendulum()
     loaded: Any = BisimSAC.load(saved, env=None if how == "set_env" else env)
     if how == "set_env":
         loaded.set_env(env)
     assert len(bonus_layers(loaded)) == 1
-    loaded.learn(12, reset_num_timesteps=False)  # the buffer is empty again: fill it
+    loaded.learn(12, reset_num_timesteps=False)  # the loaded model starts with an empty buffer
     assert loaded._n_updates == 7 + 12
     assert not np.array_equal(actions_of(loaded), actions_of(trained))
     assert all(value is not None for value in bonuses(loaded))
 
 
-def test_set_env_takes_the_wrapper_that_is_there_and_each_model_learns_from_its_own_bonus() -> None:
+def test_set_env_uses_an_existing_wrapper_and_each_model_learns_from_its_own_bonus() -> None:
     first, env = make_model(), IntrinsicRewardVecEnv(DummyVecEnv([pendulum]))
     for _ in range(2):
         first.set_env(env)
@@ -116,7 +107,7 @@ def test_set_env_takes_the_wrapper_that_is_there_and_each_model_learns_from_its_
     assert all(bonuses(first))
 
 
-def test_set_env_moves_to_a_vecnormalize_with_the_bonus_inside() -> None:
+def test_set_env_accepts_a_vecnormalize_with_the_bonus_inside() -> None:
     model = make_model()
     env = VecNormalize(IntrinsicRewardVecEnv(DummyVecEnv([pendulum])), norm_reward=False)
     model.set_env(env)
@@ -142,7 +133,7 @@ model.save(folder / "later")
 """
 
 
-def test_a_fresh_process_takes_over_where_training_stopped(trained: Any, saved: Path) -> None:
+def test_a_fresh_process_continues_where_training_stopped(trained: Any, saved: Path) -> None:
     folder = saved.parent
     trained.save_replay_buffer(folder / "buffer")
     np.save(folder / "observations.npy", OBSERVATIONS)
@@ -181,7 +172,7 @@ def test_extras_can_be_switched_at_load(saved: Path) -> None:
 
 
 @pytest.mark.parametrize("dynamics", ["probabilistic", "ensemble"])
-def test_each_kind_of_dynamics_model_comes_back(tmp_path: Path, dynamics: Any) -> None:
+def test_load_restores_each_kind_of_dynamics_model(tmp_path: Path, dynamics: Any) -> None:
     model = make_model(dynamics=dynamics).learn(12)
     model.save(tmp_path / "model")
     loaded: Any = BisimSAC.load(tmp_path / "model", env=pendulum())
@@ -189,7 +180,7 @@ def test_each_kind_of_dynamics_model_comes_back(tmp_path: Path, dynamics: Any) -
     assert all(bonuses(loaded))
 
 
-def test_the_replay_buffer_comes_back_with_the_bonus_in_its_rewards(trained: Any, tmp_path: Path) -> None:
+def test_a_loaded_replay_buffer_keeps_the_bonus_in_its_rewards(trained: Any, tmp_path: Path) -> None:
     trained.save_replay_buffer(tmp_path / "buffer")
     other = make_model()
     other.load_replay_buffer(tmp_path / "buffer")
@@ -200,7 +191,7 @@ def test_the_replay_buffer_comes_back_with_the_bonus_in_its_rewards(trained: Any
     assert other.replay_buffer.size() == 18
 
 
-def test_the_policy_alone_comes_back(trained: Any, tmp_path: Path) -> None:
+def test_a_policy_can_be_saved_and_loaded_without_its_model(trained: Any, tmp_path: Path) -> None:
     trained.policy.save(tmp_path / "policy.pkl")
     policy = MlpPolicy.load(str(tmp_path / "policy.pkl"), device=trained.device)
     np.testing.assert_array_equal(actions_of(policy), actions_of(trained))
@@ -208,7 +199,7 @@ def test_the_policy_alone_comes_back(trained: Any, tmp_path: Path) -> None:
     assert policy.critic.features_extractor.radius == trained.radius
 
 
-def test_parameters_travel_between_models_and_must_be_complete(trained: Any) -> None:
+def test_parameters_can_be_copied_between_models_and_must_be_complete(trained: Any) -> None:
     other = make_model(seed=1)
     assert not np.allclose(actions_of(other), actions_of(trained))
     other.set_parameters(trained.get_parameters())
@@ -244,7 +235,8 @@ def test_a_failing_save_leaves_the_old_file_and_nothing_else(tmp_path: Path, met
     model = make_model()
     getattr(model, method)(path.with_suffix(""))
     before = path.read_bytes()
-    model.lock = model.replay_buffer.lock = threading.Lock()  # cannot be pickled: SB3 notices with the file open already
+    # a lock cannot be pickled, and SB3 notices only after it has opened the file
+    model.lock = model.replay_buffer.lock = threading.Lock()
     for target in (path, str(path.with_suffix(""))):
         with pytest.raises(TypeError, match="lock"):
             getattr(model, method)(target)

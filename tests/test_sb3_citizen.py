@@ -1,6 +1,7 @@
 """BisimSAC keeps the contract of a Stable-Baselines3 algorithm, with bonus and inverse dynamics switched on."""
 
 from copy import deepcopy
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,9 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from small_models import EPISODE, SMALL, pendulum
+from small_models import EPISODE, dicts, images, make_model, parameters, pendulum, with_data
 from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
-from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv, SimpleMultiObsEnv
+from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize, VecTransposeImage, is_vecenv_wrapped
@@ -24,28 +25,8 @@ from sb3_robust_bisim.encoders import MlpEncoder
 from sb3_robust_bisim.latent_models import DYNAMICS
 from sb3_robust_bisim.losses import DISTANCES
 
-
-def unpaid_pendulum() -> gym.Env:
-    """A pendulum without reward: what the replay buffer holds is the bonus alone."""
-    return gym.wrappers.TransformReward(pendulum(), lambda reward: 0.0)
-
-
-def images() -> gym.Env:
-    return FakeImageEnv(screen_height=12, screen_width=12, n_channels=1, discrete=False)
-
-
-def make_model(policy: str = "MlpPolicy", env: Any = None, **kwargs: Any) -> Any:
-    """A small BisimSAC; typed as Any, since half of an algorithm's attributes are Optional."""
-    return BisimSAC(policy, pendulum() if env is None else env, **{**SMALL, "buffer_size": 100, **kwargs})
-
-
-def with_data(*args: Any, **kwargs: Any) -> Any:
-    """A model that has gathered random transitions and not yet trained, for tests that call ``train`` themselves."""
-    return make_model(*args, **{"learning_starts": 1000, **kwargs}).learn(20)
-
-
-def parameters(module: nn.Module) -> th.Tensor:
-    return nn.utils.parameters_to_vector(module.parameters()).detach().clone()
+# It pays no reward, so the replay buffer holds only the bonus
+unpaid_pendulum = partial(pendulum, reward=0.0)
 
 
 def learning_rate_of(optimizer: th.optim.Optimizer | None) -> float:
@@ -55,7 +36,7 @@ def learning_rate_of(optimizer: th.optim.Optimizer | None) -> float:
 
 @pytest.mark.parametrize(("dynamics", "distance"), product(DYNAMICS, DISTANCES))
 def test_every_dynamics_model_trains_under_every_distance(dynamics: Any, distance: Any) -> None:
-    model = make_model(dynamics=dynamics, distance=distance)
+    model = make_model(dynamics=dynamics, distance=distance, norm_constraint="sphere" if distance == "cosine" else True)
     before = parameters(model.policy)
     model.learn(EPISODE + 3)
     after = parameters(model.policy)
@@ -88,7 +69,7 @@ def test_any_number_of_critics_trains(n_critics: int) -> None:
     [
         (1, 4, 2, 16),  # after steps 12, 16, ..., 40
         (1, (4, "step"), -1, 32),
-        (1, (1, "episode"), -1, 30),  # the first episode is warm-up
+        (1, (1, "episode"), -1, 30),  # no updates during the first episode
         (2, (3, "step"), -1, 36),  # 12, 18, ..., 42 transitions
         (2, 5, 0, 0),
     ],
@@ -105,7 +86,7 @@ def test_several_environments_train_with_gsde_and_action_noise(venv_class: type)
     options = dict(start_method="spawn") if venv_class is SubprocVecEnv else {}
     noise = NormalActionNoise(np.zeros(1), 0.1 * np.ones(1))
     env = venv_class([unpaid_pendulum] * 2, **options)
-    # several actor updates per call: gSDE must draw its noise anew for each
+    # gSDE must draw new noise for each of the actor updates of a call
     model = make_model(env=env, use_sde=True, sde_sample_freq=2, action_noise=noise, train_freq=10, gradient_steps=4)
     model.learn(40)
     assert model._n_updates == 8
@@ -126,7 +107,7 @@ def test_cnn_policy_takes_channel_last_images() -> None:
 
 
 @pytest.mark.parametrize(("policy", "env"), [("MlpPolicy", pendulum), ("CnnPolicy", images)])
-def test_a_shared_encoder_is_one_object_and_an_own_one_is_another(policy: str, env: Any) -> None:
+def test_actor_and_critic_share_one_encoder_or_train_one_each(policy: str, env: Any) -> None:
     shared = make_model(policy, env())
     assert shared.actor.features_extractor is shared.critic.features_extractor
     assert shared.critic_target.features_extractor is not shared.critic.features_extractor
@@ -151,7 +132,7 @@ def test_the_target_encoder_stays_at_tau_0_and_is_a_copy_at_tau_1(tau: float, sh
 
 
 def test_dict_observations_train_with_the_multi_input_policy() -> None:
-    env = SimpleMultiObsEnv(discrete_actions=False)
+    env = dicts()
     model = make_model("MultiInputPolicy", env).learn(EPISODE + 3)
     assert model._n_updates == 3
     obs, _ = env.reset()
@@ -196,19 +177,17 @@ def test_observations_may_be_normalised(bonus: bool) -> None:
 
 
 def test_evaluation_under_vecnormalize_shares_its_statistics_and_sees_no_bonus() -> None:
-    def paid() -> gym.Env:
-        return gym.wrappers.TransformReward(pendulum(), lambda reward: 1.0)
-
+    paid = partial(pendulum, reward=1.0)
     env: Any = VecNormalize(IntrinsicRewardVecEnv(DummyVecEnv([paid])), norm_reward=False)
     eval_env: Any = VecNormalize(IntrinsicRewardVecEnv(DummyVecEnv([paid])), norm_reward=False, training=False)
     callback = EvalCallback(eval_env, eval_freq=20, n_eval_episodes=2, verbose=0, warn=False)
     make_model(env=env).learn(20, callback)
     assert callback.last_mean_reward == EPISODE
     np.testing.assert_array_equal(eval_env.obs_rms.mean, env.obs_rms.mean)
-    assert env.obs_rms.count > 20  # and it has seen something
+    assert env.obs_rms.count > 20  # the statistics are not those of an empty environment
 
 
-def test_callbacks_checkpoint_and_stop(tmp_path: Path) -> None:
+def test_sb3s_callbacks_save_checkpoints_and_stop_training(tmp_path: Path) -> None:
     env = VecNormalize(IntrinsicRewardVecEnv(DummyVecEnv([pendulum])), norm_reward=False)
     checkpoint = CheckpointCallback(8, str(tmp_path), save_replay_buffer=True, save_vecnormalize=True)
     model = make_model(env=env).learn(100, [checkpoint, StopTrainingOnMaxEpisodes(max_episodes=2)])
@@ -223,7 +202,7 @@ def test_callbacks_checkpoint_and_stop(tmp_path: Path) -> None:
 
 
 class NormDropout(BaseFeaturesExtractor):
-    """An encoder that behaves differently while training."""
+    """An encoder that behaves differently in training."""
 
     def __init__(self, observation_space: spaces.Box) -> None:
         super().__init__(observation_space, observation_space.shape[0])
@@ -235,12 +214,12 @@ class NormDropout(BaseFeaturesExtractor):
 
 
 @pytest.mark.parametrize("share", [True, False])
-def test_batch_norm_and_dropout_act_in_training_alone(share: bool) -> None:
+def test_batch_norm_and_dropout_act_only_in_training(share: bool) -> None:
     policy_kwargs = dict(net_arch=[16], features_extractor_class=NormDropout, share_features_extractor=share)
     model = with_data(policy_kwargs=policy_kwargs, tau=0.0, target_update_interval=2)
     nets = (model.critic, model.critic_target, model.actor)
     norm, target_norm, actor_norm = (net.features_extractor.extractor.norm for net in nets)
-    assert norm.running_mean.eq(0).all()  # acting and the bonus leave the statistics alone
+    assert norm.running_mean.eq(0).all()  # acting and the bonus do not change the statistics
     obs = np.ones((4, 3), dtype=np.float32)
     np.testing.assert_array_equal(model.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
 
@@ -300,13 +279,13 @@ def test_net_arch_optimizer_and_the_users_dict_are_respected() -> None:
     assert policy_kwargs == before
 
 
-def test_optimizer_settings_that_adams_fused_kernel_does_not_know_are_taken() -> None:
+def test_optimizer_settings_unknown_to_adams_fused_kernel_are_accepted() -> None:
     policy_kwargs = dict(net_arch=[16], optimizer_kwargs=dict(differentiable=True))
     assert make_model(policy_kwargs=policy_kwargs).actor.optimizer.param_groups[0]["differentiable"]
 
 
 @pytest.mark.parametrize("share", [True, False])
-def test_a_frozen_encoder_stays_as_it_is(share: bool) -> None:
+def test_training_does_not_change_a_frozen_encoder(share: bool) -> None:
     class Pretrained(MlpEncoder):
         def __init__(self, observation_space: gym.Space) -> None:
             super().__init__(observation_space)
@@ -322,7 +301,7 @@ def test_a_frozen_encoder_stays_as_it_is(share: bool) -> None:
     assert not th.equal(mu, parameters(model.actor.mu))
 
 
-def test_the_schedule_reaches_every_optimizer_but_that_of_the_inverse_dynamics() -> None:
+def test_the_schedule_reaches_every_optimizer_except_that_of_the_inverse_dynamics() -> None:
     model = make_model(learning_rate=lambda remaining: 1e-3 * (1 + remaining))
     optimizers = model.actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer
     assert [learning_rate_of(optimizer) for optimizer in optimizers] == [2e-3] * 3
@@ -331,7 +310,7 @@ def test_the_schedule_reaches_every_optimizer_but_that_of_the_inverse_dynamics()
     assert learning_rate_of(model.policy.representation.inverse_dynamics.optimizer) == 1e-4
 
 
-def test_delays_count_all_updates_also_at_one_gradient_step_per_call() -> None:
+def test_delays_count_all_updates_even_with_one_gradient_step_per_call() -> None:
     model = with_data(policy_delay=2, target_update_interval=3, tau=1.0)
     actor_moved, entropy_moved, target_moved = [], [], []
     for update in range(1, 7):
@@ -344,33 +323,32 @@ def test_delays_count_all_updates_also_at_one_gradient_step_per_call() -> None:
     assert target_moved == [3, 6]
 
 
-def test_the_initial_gradient_steps_are_done_once() -> None:
+def test_the_initial_gradient_steps_happen_once() -> None:
     model = make_model(initial_gradient_steps=7)
     counts = [model.learn(1, reset_num_timesteps=False)._n_updates for _ in range(EPISODE + 3)]
     assert counts == [0] * EPISODE + [7, 8, 9]
 
 
-def test_images_that_are_floats_already_are_encoded_as_they_are() -> None:
+def test_images_of_floats_are_encoded_without_division_by_255() -> None:
     class FloatImages(gym.ObservationWrapper):
         def __init__(self, env: gym.Env) -> None:
             super().__init__(env)
-            self.observation_space = gym.spaces.Box(0, 1, (1, 36, 36), np.float32)
+            self.observation_space = spaces.Box(0, 1, (1, 12, 12), np.float32)
 
         def observation(self, observation: np.ndarray) -> np.ndarray:
-            return observation.reshape(1, 36, 36).astype(np.float32) / 255
+            return observation.reshape(1, 12, 12).astype(np.float32) / 255
 
-    env = FloatImages(FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False, channel_first=True))
     policy_kwargs = dict(normalize_images=False, net_arch=[16])
-    model = BisimSAC("CnnPolicy", env, buffer_size=50, learning_starts=10, batch_size=4, policy_kwargs=policy_kwargs).learn(14)
+    model = make_model("CnnPolicy", FloatImages(images()), policy_kwargs=policy_kwargs).learn(EPISODE + 4)
     encoder, seen = model.critic.features_extractor, []
     encoder.extractor.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
-    obs = th.rand(2, 1, 36, 36)
+    obs = th.rand(2, 1, 12, 12)
     encoder.encode(obs)
     assert th.equal(seen[0], obs)  # not divided by 255
 
 
-def test_one_setting_of_the_inverse_dynamics_optimizer_leaves_the_others() -> None:
+def test_one_setting_of_the_inverse_dynamics_optimizer_keeps_the_other_defaults() -> None:
     policy_kwargs = dict(inverse_dynamics_optimizer_kwargs=dict(weight_decay=0.0, foreach=True), net_arch=[16])
-    policy = BisimSAC("MlpPolicy", "Pendulum-v1", policy_kwargs=policy_kwargs).policy
+    policy = make_model(policy_kwargs=policy_kwargs).policy
     group = policy.representation.inverse_dynamics.optimizer.param_groups[0]
     assert (group["lr"], group["weight_decay"], group["foreach"]) == (1e-4, 0.0, True)

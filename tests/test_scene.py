@@ -1,4 +1,4 @@
-"""Camera poses and colours at random: within bounds, reproducible, with any background, and gone when the frame is drawn."""
+"""Random camera poses and colours stay in bounds, are reproducible and leave no trace in the model."""
 
 import math
 import pickle
@@ -38,7 +38,7 @@ Make = Callable[..., PixelTask]
 
 
 def play(env: PixelTask, seed: int | None, steps: int = 3) -> dict[str, np.ndarray]:
-    """What is seen, the states and the rewards of the start of an episode with the same actions each time."""
+    """Frames, states and rewards of the first steps of an episode. The actions are always the same."""
     frames, states, rewards = [env.reset(seed=seed)[0]], [env.physics.get_state()], []
     env.action_space.seed(0)
     for _ in range(steps):
@@ -50,7 +50,7 @@ def play(env: PixelTask, seed: int | None, steps: int = 3) -> dict[str, np.ndarr
 
 
 def objects(env: PixelTask) -> np.ndarray:
-    """Mask of the pixels that no background, black or white, can change."""
+    """Mask of the pixels that are the same on a black and on a white background."""
     assert isinstance(env.distraction.background, ColorDistractor)
     frames = []
     for shade in (0, 255):
@@ -59,13 +59,13 @@ def objects(env: PixelTask) -> np.ndarray:
     return (frames[0] == frames[1]).all(-1)
 
 
-# Both, in the environment
+# Camera and colours in the environment
 
 
 @pytest.mark.parametrize("dynamic", [False, True])
 @pytest.mark.parametrize("distractor", ["none", "balls"])
 @pytest.mark.parametrize(("camera", "color"), [("easy", None), (None, "easy"), ("hard", "hard")])
-def test_a_seed_reproduces_what_is_seen_and_the_states_are_those_without_distraction(
+def test_a_seed_reproduces_the_frames_and_the_states_do_not_depend_on_the_distraction(
     make: Make, camera: str | None, color: str | None, distractor: str, dynamic: bool
 ) -> None:
     kwargs = dict(camera_distraction=camera, color_distraction=color, dynamic=dynamic)
@@ -82,9 +82,7 @@ def test_a_seed_reproduces_what_is_seen_and_the_states_are_those_without_distrac
 
 
 @pytest.mark.parametrize("dynamic", [False, True])
-def test_pose_and_colours_are_new_in_every_episode_and_change_within_one_only_where_they_are_dynamic(
-    make: Make, dynamic: bool
-) -> None:
+def test_pose_and_colours_change_between_episodes_and_only_dynamic_ones_within_an_episode(make: Make, dynamic: bool) -> None:
     env = make("reacher-easy", dynamic=dynamic, shadows=False, size=32, **HARD)
     camera, colors = env.distraction.camera, env.distraction.colors
     assert camera is not None
@@ -101,21 +99,21 @@ def test_pose_and_colours_are_new_in_every_episode_and_change_within_one_only_wh
 
 
 @pytest.mark.parametrize("distractor", ["none", "noise"])
-def test_a_pickled_environment_goes_on_exactly_within_and_beyond_the_episode(make: Make, distractor: str) -> None:
+def test_a_pickled_environment_continues_exactly_within_and_beyond_the_episode(make: Make, distractor: str) -> None:
     env = make("walker-walk", distractor=distractor, dynamic=True, shadows=False, size=32, **HARD)
     play(env, seed=0)
     copied = pickle.loads(pickle.dumps(env))
     action = env.action_space.sample()
     for _ in range(3):
         np.testing.assert_array_equal(copied.step(action)[0], env.step(action)[0])
-    # The start state is drawn by a generator that travels along as well
+    # The generator of the start state is copied too
     np.testing.assert_array_equal(copied.reset()[0], env.reset()[0])
     np.testing.assert_array_equal(copied.step(action)[0], env.step(action)[0])
     np.testing.assert_array_equal(copied.look(), env.look())
     copied.close()
 
 
-def test_pose_and_colours_are_the_same_for_every_background_and_do_not_depend_on_each_other(make: Make) -> None:
+def test_pose_and_colours_depend_neither_on_the_background_nor_on_each_other(make: Make) -> None:
     seen = []
     for distractor, names in product(("none", "noise"), (["camera_distraction"], ["color_distraction"], list(HARD))):
         env = make("cheetah-run", distractor=distractor, dynamic=True, size=16, **{name: "hard" for name in names})
@@ -128,7 +126,7 @@ def test_pose_and_colours_are_the_same_for_every_background_and_do_not_depend_on
     assert all(np.array_equal(color, colors[0]) for color in colors)
 
 
-def test_nothing_of_it_stays_in_the_model_and_the_clean_frame_is_that_of_dm_control(make: Make) -> None:
+def test_rendering_restores_the_model_and_the_clean_frame_equals_that_of_dm_control(make: Make) -> None:
     env = make("cheetah-run", clean_obs=True, dynamic=True, render_mode="rgb_array", **HARD)
     model, data = env.physics.model.ptr, env.physics.data.ptr
     usual = [model.mat_rgba.copy(), model.geom_rgba.copy(), model.cam_pos.copy()]
@@ -151,7 +149,7 @@ def test_the_agent_sees_what_render_shows(make: Make) -> None:
 
 
 @pytest.mark.parametrize("distractor", ["none", "color", "video"])
-def test_a_look_shows_the_same_state_under_another_distraction_and_leaves_the_episode_alone(
+def test_a_look_shows_the_same_state_under_another_distraction_and_does_not_change_the_episode(
     make: Make, distractor: str
 ) -> None:
     kwargs = dict(distractor=distractor, dynamic=True, shadows=False, size=32) | HARD
@@ -178,7 +176,7 @@ def test_a_look_without_any_distraction_is_the_frame(make: Make) -> None:
 
 
 @pytest.mark.parametrize("task", ["cheetah-run", "reacher-easy", "finger-spin", "fish-swim", "manipulator-bring_ball"])
-def test_no_object_becomes_background_however_dark_its_colour(make: Make, task: str) -> None:
+def test_even_the_darkest_object_is_not_taken_for_background(make: Make, task: str) -> None:
     env = make(task, distractor="color")
     env.reset(seed=0)
     model = env.physics.model.ptr
@@ -203,7 +201,7 @@ def test_planes_stay_hidden_from_a_camera_elsewhere(make: Make) -> None:
         assert 50 < covered.sum() < 1500  # the ground would cover thousands
 
 
-def test_it_keeps_the_contract_of_gymnasium(make: Make) -> None:
+def test_a_distracted_scene_keeps_the_contract_of_gymnasium(make: Make) -> None:
     check_env(make("point_mass-easy", distractor="noise", dynamic=True, **HARD))
 
 
@@ -376,7 +374,7 @@ def test_moving_colours_take_gaussian_steps() -> None:
 
 
 def two_colors() -> Any:
-    """A material, a geom that wears it, one with a colour of its own beside it, and one without a material in grey."""
+    """A material and three geoms: one in it, one in it with its own colour, and a grey one without a material."""
     import mujoco
 
     return mujoco.MjModel.from_xml_string("""

@@ -1,29 +1,29 @@
-"""What BisimSAC writes for TensorBoard is there, finite, and means what its name says."""
+"""BisimSAC writes every key for TensorBoard. The values are finite and match their names."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
+from small_models import EPISODE, SMALL, events, pendulum
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_robust_bisim import BisimSAC
 
-EPISODE, BATCH_SIZE = 10, 8
+BATCH_SIZE = SMALL["batch_size"]
 SB3_KEYS = {"train/learning_rate", "rollout/ep_rew_mean", "rollout/ep_len_mean", "time/fps"}
 SAC_KEYS = {"train/critic_loss", "train/actor_loss", "train/ent_coef", "train/ent_coef_loss"}
 EMBEDDING_KEYS = {"bisim/embedding_norm_mean", "bisim/embedding_norm_max", "bisim/embedding_std"}
 MODEL_KEYS = {"train/dynamics_loss", "train/reward_loss"}
 METRIC_KEYS = {"train/bisim_loss", "bisim/mu_bd", "bisim/mu_rd", "bisim/mu_ratio", "bisim/mu_ratio_target"}
-RATIO_FREE = METRIC_KEYS - {"bisim/mu_ratio"}  # all rewards equal: no ratio
+RATIO_FREE = METRIC_KEYS - {"bisim/mu_ratio"}  # no ratio exists for equal rewards
 CLAMP_KEY, INVERSE_KEY, BONUS_KEY = "bisim/clamp_fraction", "train/inverse_dynamics_loss", "rollout/intrinsic_reward"
 
 
 class Bonuses(BaseCallback):
-    """Keeps what the infos of each step say of the bonus, one number per environment."""
+    """Keeps the bonuses in the infos of each step, one number per environment."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -34,34 +34,25 @@ class Bonuses(BaseCallback):
         return True
 
 
-def paid_pendulum() -> gym.Env:
-    """Every step of it pays 0.5, so that an episode returns 5."""
-    return gym.wrappers.TransformReward(gym.make("Pendulum-v1", max_episode_steps=EPISODE), lambda reward: 0.5)
-
-
 def run(folder: Path, callback: BaseCallback | None = None, **kwargs: Any) -> dict[str, np.ndarray]:
-    """What three episodes in each of two environments write, by key: one value per pair of episodes."""
-    settings: dict[str, Any] = dict(
-        policy_kwargs=dict(net_arch=[16]), learning_starts=EPISODE, batch_size=BATCH_SIZE, buffer_size=100, seed=0
-    )
-    env = make_vec_env(paid_pendulum, n_envs=2)
-    model = BisimSAC("MlpPolicy", env, tensorboard_log=str(folder), train_freq=2, gradient_steps=3, **settings, **kwargs)
+    """The values written by three episodes in each of two environments, by key. There is one per pair of episodes."""
+    env = make_vec_env(partial(pendulum, reward=0.5), n_envs=2)
+    model = BisimSAC("MlpPolicy", env, tensorboard_log=str(folder), train_freq=2, gradient_steps=3, **SMALL, **kwargs)
     model.learn(2 * 3 * EPISODE, callback, log_interval=2)
     model.logger.close()
-    events = EventAccumulator(str(folder / "BisimSAC_1"))
-    events.Reload()
-    return {key: np.array([event.value for event in events.Scalars(key)]) for key in events.Tags()["scalars"]}
+    found = events(folder)
+    return {key: np.array([event.value for event in found.Scalars(key)]) for key in found.Tags()["scalars"]}
 
 
 @pytest.fixture(scope="module")
 def full_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The full method, in so small a ball that some embeddings meet its surface, and (30, 2) bonuses from the infos."""
+    """A run of the full method and its (30, 2) bonuses. The ball is so small that some embeddings reach its surface."""
     callback = Bonuses()
     method = dict(intrinsic_reward_scale=0.3, inverse_dynamics_coef=1.0, c_r=0.5, c_t=0.8)
     return run(tmp_path_factory.mktemp("full"), callback, **method), np.array(callback.seen)
 
 
-def test_every_key_is_written_with_finite_values_when_everything_is_on(full_run: Any) -> None:
+def test_every_key_has_finite_values_when_everything_is_on(full_run: Any) -> None:
     found, _ = full_run
     wanted = SB3_KEYS | SAC_KEYS | EMBEDDING_KEYS | MODEL_KEYS | METRIC_KEYS | {CLAMP_KEY, INVERSE_KEY, BONUS_KEY}
     assert found.keys() >= wanted
@@ -70,14 +61,14 @@ def test_every_key_is_written_with_finite_values_when_everything_is_on(full_run:
         assert np.isfinite(found[key]).all(), key
 
 
-def test_losses_have_the_signs_of_losses(full_run: Any) -> None:
+def test_losses_are_positive(full_run: Any) -> None:
     found, _ = full_run
     for key in ("critic_loss", "bisim_loss", "dynamics_loss", "reward_loss", "inverse_dynamics_loss", "ent_coef"):
         assert (found[f"train/{key}"] > 0).all(), key
     assert found[INVERSE_KEY].max() < 2  # mean distance to actions in [-1, 1]
 
 
-def test_the_ratio_of_distances_stands_beside_its_target(full_run: Any) -> None:
+def test_the_ratio_of_distances_is_written_with_its_target(full_run: Any) -> None:
     found, _ = full_run
     assert (found["bisim/mu_bd"] > 0).all()
     np.testing.assert_allclose(found["bisim/mu_ratio"], found["bisim/mu_bd"] / found["bisim/mu_rd"], rtol=1e-5)
@@ -97,14 +88,14 @@ def test_embedding_norms_respect_the_radius_and_the_clamp_counts_what_touches_it
     np.testing.assert_array_equal(fraction > 0, largest > radius * (1 - 2e-6))
 
 
-def test_a_wide_ball_clamps_nothing_and_equal_rewards_have_no_distance(tmp_path: Path) -> None:
+def test_a_wide_ball_clamps_nothing_and_equal_rewards_have_no_ratio(tmp_path: Path) -> None:
     found = run(tmp_path, reward_range=(-1000.0, 1000.0))
     assert (found[CLAMP_KEY] == 0).all()
     assert (found["bisim/mu_rd"] == 0).all()
-    assert "bisim/mu_ratio" not in found  # there is none
+    assert "bisim/mu_ratio" not in found  # the ratio does not exist
 
 
-def test_the_bonus_is_the_mean_of_what_the_infos_held_since_the_last_row(full_run: Any) -> None:
+def test_the_bonus_is_the_mean_of_the_infos_since_the_last_row(full_run: Any) -> None:
     found, bonuses = full_run
     assert bonuses.std() > 0
     np.testing.assert_allclose(found[BONUS_KEY], bonuses.reshape(3, -1).mean(axis=1), rtol=1e-5)
@@ -126,7 +117,7 @@ def test_the_return_is_the_extrinsic_one(full_run: Any) -> None:
         (dict(inverse_dynamics_coef=1.0), {INVERSE_KEY}, {BONUS_KEY}),
     ],
 )
-def test_what_is_switched_off_is_not_written(
+def test_parts_that_are_switched_off_write_nothing(
     settings: dict[str, Any], written: set[str], left_out: set[str], tmp_path: Path
 ) -> None:
     found = run(tmp_path, **settings)

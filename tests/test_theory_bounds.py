@@ -1,4 +1,4 @@
-"""Bounds on diameters, values and model errors: true on random finite MDPs, with counterexamples where a condition matters."""
+"""Bounds on diameters, values and model errors hold on random finite MDPs. Counterexamples show which conditions matter."""
 
 import re
 from typing import Any

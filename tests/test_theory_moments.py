@@ -1,4 +1,4 @@
-"""Mean and variance of distances: the paper's statements on random finite MDPs, and where they end."""
+"""The paper's statements about the mean and variance of distances, on random finite MDPs, with counterexamples."""
 
 import numpy as np
 import ot

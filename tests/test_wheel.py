@@ -1,4 +1,4 @@
-"""What a user installs: built from the sdist, in an environment of its own, away from the repository."""
+"""The wheel that a user installs works in a separate environment, away from the repository. It is built from the sdist."""
 
 import os
 import shutil
@@ -23,7 +23,7 @@ def run(*command: str | Path, folder: Path) -> str:
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Paths of a virtual environment with the wheel. It sees the packages of the running one, but no editable installs."""
+    """Paths of a virtual environment with the wheel. It also sees the installed packages, except editable installs."""
     folder = tmp_path_factory.mktemp("wheel")
     source = folder / "source"  # a copy, because building leaves files behind
     for name in ("sb3_robust_bisim", "zoo_configs", "tests"):
@@ -44,7 +44,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return paths
 
 
-def test_the_wheel_has_every_file_of_the_package_and_the_configurations(installed: dict[str, Path]) -> None:
+def test_the_wheel_contains_every_file_of_the_package_and_the_configurations(installed: dict[str, Path]) -> None:
     def files(folder: Path) -> set[str]:
         return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file() and path.suffix != ".pyc"}
 

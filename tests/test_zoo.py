@@ -31,7 +31,7 @@ SHORT = ["-n", "120", "-params", "learning_starts:50", "batch_size:16", "initial
 
 
 class Zoo:
-    """The command line in this process: importing torch and the zoo anew takes longer than any of these runs."""
+    """The command line in this process. A new process would spend longer on importing torch than on any of these runs."""
 
     def __init__(self, capsys: pytest.CaptureFixture) -> None:
         self.capsys = capsys
@@ -79,7 +79,7 @@ def test_the_config_files_hold_known_keys_and_the_papers_numbers(env_id: str) ->
     paper = {CARTPOLE: (2, 1, 50_000), PENDULUM: (0.1, 0.1, 100_000), MOUNTAIN_CAR: (20, 20, 100_000)}[env_id]
     assert (entry["intrinsic_reward_scale"], entry["inverse_dynamics_coef"], entry["n_timesteps"]) == paper
     assert (entry["batch_size"], entry["buffer_size"], entry["learning_rate"]) == (512, 50_000, 1e-3)
-    # the published code's reading of the clamp, 0.1 before scaling, where it decides
+    # the published code clamps at 0.1 before scaling, which matters for this task
     assert entry.get("intrinsic_reward_max", 0.1) == (2.0 if env_id == MOUNTAIN_CAR else 0.1)
 
 
@@ -90,7 +90,7 @@ def test_train_evaluates_in_the_standard_task_and_reports_and_resumes_and_plays(
     run = tmp_path / "bisim_sac" / "robust_bisim-SparseCartPole-v0_1"
     evaluations = np.load(run / "evaluations.npz")
     assert evaluations["timesteps"].tolist() == [40, 80, 120]
-    # in the standard task every step pays 1, in the sparse one almost none does
+    # every step pays 1 in the standard task, and almost no step does in the sparse one
     np.testing.assert_array_equal(evaluations["results"], evaluations["ep_lengths"])
     assert f"before training (step 40): {evaluations['results'][0].mean():.1f}" in output
     assert f"after training (step 120): {evaluations['results'][-1].mean():.1f}" in output
@@ -104,25 +104,25 @@ def test_train_evaluates_in_the_standard_task_and_reports_and_resumes_and_plays(
 
     resumed = zoo("train", "--env", CARTPOLE, *common, "-i", str(run / "robust_bisim-SparseCartPole-v0.zip"), *SHORT)
     assert "Loading pretrained agent" in resumed
-    assert "at first (step 40)" in resumed  # it had learned before
+    assert "at first (step 40)" in resumed  # the agent had learned before
     second = tmp_path / "bisim_sac" / "robust_bisim-SparseCartPole-v0_2"
     model = BisimSAC.load(second / "robust_bisim-SparseCartPole-v0.zip")
     assert (model.intrinsic_reward_scale, model.inverse_dynamics_coef) == (0.0, 0.3)  # still normed-ID, with its -params
     arguments = yaml.unsafe_load((second / "robust_bisim-SparseCartPole-v0" / "args.yml").read_text())
-    assert arguments["hyperparams"]["inverse_dynamics_coef"] == 0.3  # and so would a third one
-    (tmp_path / "bisim_sac" / "robust_bisim-SparseCartPole-v0_3").mkdir()  # as Optuna or a run that failed leaves it
+    assert arguments["hyperparams"]["inverse_dynamics_coef"] == 0.3  # so a third run would keep it too
+    (tmp_path / "bisim_sac" / "robust_bisim-SparseCartPole-v0_3").mkdir()  # as left behind by Optuna or a failed run
     played = zoo("enjoy", "--env", CARTPOLE, "-f", str(tmp_path), "-n", "210", "--no-render")
     assert "SparseCartPole-v0_2/" in played
     assert "Episode Reward" in played
 
 
-def test_variants_are_laid_over_each_other() -> None:
+def test_variants_can_be_combined() -> None:
     pixels = "robust_bisim/cheetah-run-pixels-v0"
     settings = variant_settings(CONFIG, pixels, "SAC", "clean", "small")
     assert settings.items() >= {**SAC, "batch_size": 128, "bf16": True}.items()
     assert settings["env_kwargs"]["distractor"] == "none"
     with pytest.raises(ValueError, match="--variant small: for robust_bisim/SparseCartPole-v0"):
-        variant_settings(CONFIG, CARTPOLE, "small")  # known to the pixel tasks alone
+        variant_settings(CONFIG, CARTPOLE, "small")  # only the pixel tasks have it
 
 
 def test_training_from_pixels_ends_with_a_video_and_what_the_agent_sees(zoo: Zoo, tmp_path: Path) -> None:
@@ -141,7 +141,7 @@ def test_training_from_pixels_ends_with_a_video_and_what_the_agent_sees(zoo: Zoo
     assert video.get_meta_data()["fps"] == 2.0  # 50 control steps of 10 ms per frame
     frame = video.get_data(10)
     assert frame.shape == (256, 256, 3)
-    assert frame.std() > 20  # there is something to be seen
+    assert frame.std() > 20  # the frame is not uniform
     assert imageio.imread(run / "what_the_agent_sees.png").shape == (3 * 84, 8 * 84, 3)
     model = BisimSAC.load(run / "robust_bisim-cartpole-swingup-pixels-v0.zip")
     assert model.bf16
@@ -149,7 +149,7 @@ def test_training_from_pixels_ends_with_a_video_and_what_the_agent_sees(zoo: Zoo
     assert model.observation_space.shape == (9, 84, 84)
 
 
-def test_training_from_pixels_ends_well_without_the_packages_for_video(
+def test_training_from_pixels_succeeds_without_the_packages_for_video(
     zoo: Zoo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("dm_control")
@@ -194,7 +194,7 @@ def test_bad_input_is_refused_before_a_run_folder_exists(zoo: Zoo, arguments: li
     assert not (tmp_path / "logs").exists()
 
 
-def test_a_task_without_settings_is_refused_with_those_that_have_some(zoo: Zoo, tmp_path: Path) -> None:
+def test_the_error_for_a_task_without_settings_lists_the_tasks_with_settings(zoo: Zoo, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"--env Pendulum-v1: .* robust_bisim/SparsePendulum-v0.* Copy the entry"):
         zoo("train", "--env", "Pendulum-v1", "-f", str(tmp_path / "logs"))
     assert not (tmp_path / "logs").exists()
@@ -214,7 +214,7 @@ def test_a_checkpoint_that_could_not_be_written_is_refused_at_once(zoo: Zoo, fil
 @pytest.mark.parametrize(
     ("starts", "last"), [(40, "still before training (step 40): 2.0"), (30, "after training (step 40): 2.0")]
 )
-def test_the_report_does_not_call_an_agent_trained_that_is_not(
+def test_the_report_calls_an_agent_trained_only_after_training(
     starts: int, last: str, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     np.savez(tmp_path / "evaluations.npz", timesteps=[20, 40], results=[[1.0, 2.0], [3.0, 1.0]])
@@ -222,7 +222,7 @@ def test_the_report_does_not_call_an_agent_trained_that_is_not(
     assert last in capsys.readouterr().out
 
 
-def test_a_config_may_have_one_entry_for_all_tasks_and_variants_that_are_empty(zoo: Zoo, tmp_path: Path) -> None:
+def test_a_config_may_have_one_entry_for_all_tasks_and_no_variants(zoo: Zoo, tmp_path: Path) -> None:
     config = tmp_path / "default.yml"
     config.write_text("variants:\ndefault: {policy: MlpPolicy, n_timesteps: 30, learning_starts: 20}\n")
     common = ["train", "--env", "Pendulum-v1", "-conf", str(config), "-f", str(tmp_path), "--eval-freq", "-1"]
@@ -271,7 +271,7 @@ def test_a_misspelt_key_in_a_config_file_is_named(zoo: Zoo, tmp_path: Path) -> N
 NO_HER = {"using_her_replay_buffer": False, "her_kwargs": {}}
 
 
-def test_optuna_samples_arguments_that_bisim_sac_takes() -> None:
+def test_optuna_samples_arguments_that_bisim_sac_accepts() -> None:
     tuned = {"intrinsic_reward_scale": 2.0, "inverse_dynamics_coef": 1.0}
 
     def objective(trial: optuna.Trial) -> float:
@@ -301,21 +301,21 @@ def test_optuna_tunes_the_method_of_the_command_with_its_policy_kwargs(zoo: Zoo,
     assert trial.state == optuna.trial.TrialState.COMPLETE
     assert {"bisim_coef", "inverse_dynamics_coef"} <= trial.params.keys()
     assert "intrinsic_reward_scale" not in trial.params  # normed-ID has no bonus
-    assert "rl_zoo3" in str(rl_zoo3.train.ExperimentManager)  # the command leaves rl-zoo3 as it was
+    assert "rl_zoo3" in str(rl_zoo3.train.ExperimentManager)  # the command does not change rl-zoo3
 
 
-def test_optuna_leaves_off_what_the_tuned_method_leaves_off() -> None:
+def test_optuna_samples_nothing_that_the_tuned_method_switches_off() -> None:
     tuned = {**SAC, "policy_kwargs": {"n_critics": 1}}
     sampled = sample_bisim_sac_params(optuna.create_study().ask(), 1, 1, NO_HER, tuned)
     assert not sampled.keys() & {"bisim_coef", "intrinsic_reward_scale", "inverse_dynamics_coef"}
     assert sampled["policy_kwargs"].keys() == {"n_critics", "net_arch"}
-    sampled = sample_bisim_sac_params(optuna.create_study().ask(), 1, 1, NO_HER)  # BisimSAC's defaults: the metric alone
+    sampled = sample_bisim_sac_params(optuna.create_study().ask(), 1, 1, NO_HER)  # BisimSAC's defaults use only the metric
     assert "bisim_coef" in sampled
     assert not sampled.keys() & {"intrinsic_reward_scale", "inverse_dynamics_coef"}
 
 
 @pytest.mark.parametrize("expression", [False, True])
-def test_a_trial_is_repeated_with_the_settings_that_it_was_found_with(zoo: Zoo, expression: bool, tmp_path: Path) -> None:
+def test_a_trial_is_repeated_with_its_own_settings(zoo: Zoo, expression: bool, tmp_path: Path) -> None:
     storage = f"sqlite:///{tmp_path}/study.db"
     study = optuna.create_study(storage=storage, study_name="pendulum")
     layers = {"features_extractor_kwargs": {"n_layers": 3}}
@@ -350,7 +350,7 @@ def test_help_shows_the_name_of_the_command_and_its_options(zoo: Zoo, command: s
     assert str(CONFIG) in ours or command == "enjoy"
 
 
-def test_it_runs_as_a_module_and_usage_names_the_commands(tmp_path: Path) -> None:
+def test_the_package_runs_as_a_module_and_its_usage_names_the_commands(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "sb3_robust_bisim", "--help"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=True)
@@ -369,7 +369,7 @@ def test_it_runs_as_a_module_and_usage_names_the_commands(tmp_path: Path) -> Non
     ],
 )
 @pytest.mark.parametrize("command", ["train", "enjoy"])
-def test_torch_has_one_thread_unless_the_user_has_chosen(
+def test_torch_uses_one_thread_unless_the_user_chooses_otherwise(
     command: str, variables: dict[str, str], arguments: list[str], threads: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in SET_BY_THE_USER:
@@ -383,7 +383,7 @@ def test_torch_has_one_thread_unless_the_user_has_chosen(
     assert seen[0][seen[0].index("--num-threads") + 1] == threads
 
 
-def test_optuna_does_not_go_with_a_checkpoint(zoo: Zoo, tmp_path: Path) -> None:
+def test_optuna_with_a_checkpoint_is_refused(zoo: Zoo, tmp_path: Path) -> None:
     for optimize in ("-optimize", "--optimize-hyper"):  # rl-zoo3 takes abbreviations
         with pytest.raises(ValueError, match=r"--checkpoint with -optimize: not supported"):
             zoo("train", "--env", CARTPOLE, optimize, "--checkpoint", "run.pkl", "-f", str(tmp_path / "logs"))

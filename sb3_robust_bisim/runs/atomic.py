@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+PathOrStream = str | Path | io.BufferedIOBase
+
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str], alone: bool = False) -> Iterator[Path]:
@@ -29,7 +31,7 @@ def atomic_path(path: str | os.PathLike[str], alone: bool = False) -> Iterator[P
 
 
 @contextmanager
-def atomic_save(path: str | os.PathLike[str] | io.BufferedIOBase, suffix: str) -> Iterator[Path | io.BufferedIOBase]:
+def atomic_save(path: PathOrStream, suffix: str) -> Iterator[Path | io.BufferedIOBase]:
     """
     ``atomic_path`` for the arguments of SB3's ``save`` methods.
 

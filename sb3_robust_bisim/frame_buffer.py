@@ -1,4 +1,4 @@
-"""A replay buffer that stores each frame of a frame-stacked image once and samples what SB3's buffer would sample."""
+"""A replay buffer that stores each frame of stacked images once, and samples the same batches as SB3's buffer."""
 
 import copyreg
 import warnings
@@ -17,34 +17,33 @@ from sb3_robust_bisim.runs.packing import pack, unpack
 
 try:
     import psutil
-except ImportError:  # an extra of SB3
+except ImportError:  # part of SB3's extras
     psutil = None
 
-BLANK = 0  # slot of the all-zero frame, with which VecFrameStack fills a stack after a reset
+BLANK = 0  # slot of the all-zero frame, which VecFrameStack uses to fill a stack after a reset
 ROWS = ("actions", "rewards", "dones", "timeouts", "_slots")  # arrays with one row per step of the environments
 
 
 class FrameStackReplayBuffer(ReplayBuffer):
     """
-    Replay buffer for frame-stacked images that stores every single frame once.
+    Replay buffer for stacked images that stores every frame once.
 
-    SB3's ``ReplayBuffer`` keeps ``2 * n_stack`` copies of each frame. Here all frames lie in one pool; a transition holds the
-    ``n_stack + 1`` pool slots that its two stacks consist of (the first ``n_stack`` are the observation, the last ``n_stack``
-    the next observation), and a slot is used again once no transition refers to it. Nothing is assumed about the length of
-    episodes or about how a stack is filled after a reset: with the first frame repeated, with zeros, or with other frames.
-    Batches are bit for bit those of SB3's ``ReplayBuffer`` for the same transitions and the same state of NumPy's global
-    random generator.
+    SB3's ``ReplayBuffer`` keeps ``2 * n_stack`` copies of each frame. Here all frames are in one pool. A transition stores the
+    ``n_stack + 1`` slots of the frames in its two stacks: the first ``n_stack`` are the observation, the last ``n_stack`` the
+    next observation. A slot is free again once no transition refers to it. Episodes can have any length, and a stack can be
+    filled in any way after a reset: with the first frame repeated, with zeros, or with other frames. For the same transitions
+    and the same state of NumPy's global random generator, batches equal those of SB3's ``ReplayBuffer`` bit by bit.
 
-    :param buffer_size: Number of transitions kept, all environments together; rounded down to whole steps, at least one
+    :param buffer_size: Number of transitions, summed over all environments; rounded down to whole steps, at least one
     :param observation_space: ``Box`` of dtype uint8 and shape ``(n_stack * C, H, W)``, or ``(H, W, n_stack * C)``; the oldest
-        frame comes first. The smallest axis is taken as the channels, as SB3 does.
+        frame comes first. The smallest axis holds the channels, as in SB3.
     :param action_space: Action space
     :param device: PyTorch device of the samples
     :param n_envs: Number of parallel environments
-    :param optimize_memory_usage: Must be False: SB3's variant overwrites the last frames of an episode
-    :param handle_timeout_termination: Treat a time-out (``info["TimeLimit.truncated"]``) as not terminal
+    :param optimize_memory_usage: Must be False, because SB3's variant overwrites the last frames of an episode
+    :param handle_timeout_termination: Do not treat a time-out (``info["TimeLimit.truncated"]``) as terminal
     :param n_stack: Number of frames in an observation, at least 1
-    :raises ValueError: if the space is not one of ``n_stack`` stacked uint8 images, or ``optimize_memory_usage`` is set
+    :raises ValueError: if the space does not hold ``n_stack`` stacked uint8 images, or ``optimize_memory_usage`` is set
 
     Example::
 
@@ -77,7 +76,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
     ) -> None:
         if optimize_memory_usage:
             raise ValueError(
-                "optimize_memory_usage=True is SB3's own way to save memory and is wrong with time-outs; "
+                "optimize_memory_usage=True is SB3's way to save memory, and it is wrong with time-outs. "
                 "FrameStackReplayBuffer needs less memory without it: pass optimize_memory_usage=False."
             )
         channels_first = _check_space(observation_space, n_stack)
@@ -94,15 +93,15 @@ class FrameStackReplayBuffer(ReplayBuffer):
         self.reset()
         n_bytes = self.buffer_size * n_envs * self._frames[BLANK].nbytes
         if psutil is not None and n_bytes > (available := psutil.virtual_memory().available):
-            # Memory is provided only when it is written to: without a warning the run would die late
-            message = f"The full replay buffer needs {n_bytes / 1e9:.2f} GB, {available / 1e9:.2f} GB are available"
+            # The system provides memory only when it is written to: without a warning, the run would fail late
+            message = f"The full replay buffer needs {n_bytes / 1e9:.2f} GB, but {available / 1e9:.2f} GB are available"
             warnings.warn(f"{message}: lower buffer_size.", stacklevel=2)
 
     def _allocate(self, n_used: int = 0) -> None:
-        """Allocate the memory for at least ``n_used`` frames; the system provides it only when it is written to."""
+        """Allocate memory for at least ``n_used`` frames. The system provides it only when it is written to."""
         rows = (self.buffer_size, self.n_envs)
-        # One new frame per transition and one per episode, which may be one step long. Slots are used from the lowest up, so
-        # what is not needed stays without memory. Only stacks that start with more than one frame make the pool grow.
+        # One new frame per transition and one per episode, which may be one step long. The lowest free slots are used first,
+        # so unused slots need no memory. The pool grows only if stacks start with more than one new frame.
         n_frames = max(2 * self.buffer_size * self.n_envs + self.n_envs * (self.n_stack + 1), n_used)
         self.actions = np.zeros((*rows, self.action_dim), dtype=self._maybe_cast_dtype(self.action_space.dtype))
         self.rewards = np.zeros(rows, dtype=np.float32)
@@ -113,13 +112,13 @@ class FrameStackReplayBuffer(ReplayBuffer):
         self._references = np.zeros(n_frames, dtype=np.int32)
 
     def reset(self) -> None:
-        """Forget all transitions; the memory stays allocated."""
+        """Remove all transitions. The memory stays allocated."""
         super().reset()
         self._slots[...] = BLANK
         self._references[...] = 0
-        self._references[BLANK] = self._slots.size + 1  # one more than there are: never given away
-        self._n_used = 1  # slots below it have been used, slots from it on never
-        self._free: list[int] = []  # used slots that no transition refers to any more
+        self._references[BLANK] = self._slots.size + 1  # more than there can be, so it is never free
+        self._n_used = 1  # slots below this number have been used, the others never
+        self._free: list[int] = []  # slots that have been used, and that no transition refers to any more
 
     def add(
         self,
@@ -134,7 +133,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         Store one transition of every environment.
 
         :param obs: Observations, ``(n_envs, *obs_shape)``
-        :param next_obs: Next observations of the same episodes, of the same shape: ``info["terminal_observation"]`` where an
+        :param next_obs: Next observations of the same episodes, of the same shape; ``info["terminal_observation"]`` if the
             episode ended
         :param action: Actions, ``(n_envs, action_dim)``
         :param reward: Rewards, ``(n_envs,)``
@@ -170,9 +169,9 @@ class FrameStackReplayBuffer(ReplayBuffer):
         """
         Find the environments whose observation is not the next observation of their last transition.
 
-        They start an episode, also where ``done`` was not set: after the environments were reset for another call of
-        ``learn`` or the buffer was loaded from a file. The storage relies on nothing but this comparison and on the shift by
-        one frame, so every transition is looked at.
+        These environments have started an episode. ``done`` is not always set before it: another call of ``learn`` resets the
+        environments, and a buffer may come from a file. The storage relies only on this comparison and on the shift by one
+        frame, so every transition is checked.
 
         :param stacks: Observations, ``(n_envs, n_stack, *frame_shape)``
         :param next_stacks: Next observations, of the same shape
@@ -181,15 +180,15 @@ class FrameStackReplayBuffer(ReplayBuffer):
         """
         starts = []
         for env_idx in range(self.n_envs):
-            # Contiguous copies of one environment stay in the cache; VecTransposeImage returns transposed views
+            # Contiguous copies of one environment fit into the cache; VecTransposeImage returns transposed views
             stack, next_stack = (np.ascontiguousarray(x[env_idx], dtype=np.uint8) for x in (stacks, next_stacks))
             if not np.array_equal(stack[1:], next_stack[:-1]):
                 raise ValueError(
                     f"The observations are not stacks of n_stack={self.n_stack} frames of shape {self._frame_shape}: the "
                     f"first {self.n_stack - 1} frames of next_obs differ from the last {self.n_stack - 1} frames of obs in "
-                    f"environment {env_idx}. Wrap the environment in VecFrameStack(env, n_stack={self.n_stack}) with nothing "
-                    "above it that changes single frames, pass the n_stack of your environment "
-                    '(replay_buffer_kwargs={"n_stack": ...}) and, in a VecEnv of your own, set info["terminal_observation"] '
+                    f"environment {env_idx}. Wrap the environment in VecFrameStack(env, n_stack={self.n_stack}), with no "
+                    "wrapper around it that changes single frames. Pass the n_stack of your environment "
+                    '(replay_buffer_kwargs={"n_stack": ...}). In a VecEnv of your own, set info["terminal_observation"] '
                     "at the end of an episode. For other images use SB3's ReplayBuffer."
                 )
             if not np.array_equal(stack, self._frames[self._slots[self.pos - 1, env_idx, 1:]]):
@@ -197,7 +196,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         return starts
 
     def _store_first_stack(self, stack: np.ndarray) -> list[int]:
-        """Store the first observation of an episode and return its slots; padding takes none of its own."""
+        """Store the first observation of an episode and return its slots. Padding needs no new slots."""
         slots: list[int] = []
         for i, frame in enumerate(stack):
             if not frame.any():
@@ -215,7 +214,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         slots.extend(range(self._n_used, self._n_used + n_new))
         self._n_used += n_new
         if self._n_used > len(self._frames):
-            # Nobody else holds these arrays, so they may move
+            # There are no other references to these arrays, so they may move
             n_frames = max(self._n_used, len(self._frames) + len(self._frames) // 8)
             self._frames.resize((n_frames, *self._frame_shape), refcheck=False)
             self._references.resize(n_frames, refcheck=False)
@@ -223,7 +222,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         return slots
 
     def _replace_row(self, slots: np.ndarray) -> None:
-        """Give the transitions at ``pos`` their new slots and free those that only the overwritten transitions had used."""
+        """Assign new slots to the transitions at ``pos``, and free the slots that only the old transitions there used."""
         old = self._slots[self.pos].flatten()
         np.add.at(self._references, slots, 1)
         np.subtract.at(self._references, old, 1)
@@ -233,8 +232,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """
         :param batch_inds: Rows of the transitions, ``(batch_size,)``
-        :param env: Normalises observations and rewards where given
-        :return: The transitions; the environment of each is drawn at random as in SB3's ``ReplayBuffer``
+        :param env: Normalises observations and rewards, if given
+        :return: The transitions; the environment of each one is random, as in SB3's ``ReplayBuffer``
         """
         env_indices = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))  # noqa: NPY002 (SB3's generator)
         slots = self._slots[batch_inds, env_indices]
@@ -246,7 +245,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
             dones.reshape(-1, 1),
             self._normalize_reward(self.rewards[batch_inds, env_indices].reshape(-1, 1), env),
         )
-        # Every array above is new already, so the tensors may share its memory: a second copy would cost as much as sampling
+        # All arrays above are new, so the tensors may share their memory. Another copy would take as long as sampling
         return ReplayBufferSamples(*map(partial(self.to_torch, copy=False), data))
 
     def _gather(self, slots: np.ndarray) -> np.ndarray:
@@ -256,7 +255,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         return channels_first if self._channels_first else np.ascontiguousarray(np.moveaxis(channels_first, 1, -1))
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[Any, ...]:
-        """Pickle the filled part only; with protocol 5, which SB3 uses, frames that do not compress are never copied."""
+        """Pickle only the filled part. With protocol 5, which SB3 uses, frames that do not compress are never copied."""
         state = self.__dict__.copy()
         for name in ROWS:
             state[name] = state[name][: self.size()]
@@ -265,7 +264,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         return copyreg.__newobj__, (type(self),), state  # type: ignore[attr-defined]
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore what ``__reduce_ex__`` returned."""
+        """Restore the state that ``__reduce_ex__`` returned."""
         rows = {name: state.pop(name) for name in ROWS}
         references, blocks = state.pop("_references"), state.pop("_frames")
         self.__dict__.update(state)
@@ -277,20 +276,20 @@ class FrameStackReplayBuffer(ReplayBuffer):
 
 
 def frames_per_observation(venv: VecEnv) -> int:
-    """How many frames a chain of wrappers stacks; 1 without a VecFrameStack."""
+    """Number of frames that a chain of wrappers stacks; 1 without a VecFrameStack."""
     stack = unwrap_vec_wrapper(venv, VecFrameStack)
     return 1 if stack is None else stack.stacked_obs.n_stack
 
 
 def _check_space(observation_space: spaces.Space, n_stack: int) -> bool:
-    """Refuse what is not a space of stacked images and return whether the channels come first."""
+    """Raise an error unless the space holds stacked images, and return whether the channels come first."""
     if n_stack < 1:
         raise ValueError(f"n_stack={n_stack} must be at least 1: pass the number of frames in an observation.")
     shape, dtype = observation_space.shape, observation_space.dtype
     if not isinstance(observation_space, spaces.Box) or shape is None or len(shape) != 3 or dtype != np.uint8:
         raise ValueError(
-            f"observation_space={observation_space} is not a Box of uint8 images with three axes, the only thing stored "
-            "here: leave the scaling of images to the policy, or use SB3's ReplayBuffer / DictReplayBuffer."
+            f"observation_space={observation_space} is not a Box of uint8 images with three axes. This buffer stores nothing "
+            "else: leave the scaling of images to the policy, or use SB3's ReplayBuffer or DictReplayBuffer."
         )
     channels_first = is_image_space_channels_first(observation_space)
     channels = shape[0 if channels_first else 2]

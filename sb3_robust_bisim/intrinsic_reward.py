@@ -1,4 +1,4 @@
-"""The intrinsic reward as a VecEnv wrapper: it knows a callable, not the algorithm."""
+"""The intrinsic reward as a VecEnv wrapper. It calls a function and does not know the algorithm."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,11 +17,11 @@ class IntrinsicRewardVecEnv(VecEnvWrapper):
     """
     Adds a bonus to the reward of each transition when it is collected, and writes it to ``info["intrinsic_reward"]``.
 
-    Until something is bound it passes everything through, so the same chain of wrappers serves training and evaluation.
-    :class:`~sb3_robust_bisim.BisimSAC` binds itself, and puts this wrapper outermost if the chain has none. Put it in
-    yourself below VecNormalize (off-policy algorithms ignore rewards changed outside of it) and above anything that
-    changes the shape of the observation, such as VecFrameStack. Rewards that pass through it count the bonus: evaluate in
-    an environment of its own, or in one that has a Monitor inside.
+    Without a bound function, the wrapper changes nothing, so training and evaluation can use the same chain of wrappers.
+    :class:`~sb3_robust_bisim.BisimSAC` binds its bonus while ``learn()`` runs, and adds this wrapper as the outermost one if
+    the chain has none. If you add it yourself, put it inside VecNormalize (off-policy algorithms ignore rewards that are
+    changed outside of it) and outside of wrappers that change the shape of observations, such as VecFrameStack. Wrappers
+    around it see rewards with the bonus, so evaluate in a separate environment, or with a Monitor inside this wrapper.
 
     Example::
 
@@ -39,8 +39,8 @@ class IntrinsicRewardVecEnv(VecEnvWrapper):
 
     def bind(self, bonus: BonusFn | None) -> None:
         """
-        :param bonus: maps observations, actions as the environment takes them, and true successors, each with n_envs
-            rows, to (n_envs,) rewards. None: pass through
+        :param bonus: function of the observations, the environment's actions and the true successors, each with n_envs
+            rows. It returns (n_envs,) rewards. None: no bonus
         """
         self._bonus = bonus
 
@@ -66,13 +66,13 @@ class IntrinsicRewardVecEnv(VecEnvWrapper):
 
 
 def _successors(obs: VecEnvObs, dones: np.ndarray, infos: list[dict[str, Any]]) -> VecEnvObs:
-    """Where the actions led: at the end of an episode ``obs`` is already the first observation of the next one."""
+    """The true successors. At the end of an episode, ``obs`` is already the first observation of the next one."""
     if not dones.any():
         return obs
     obs = deepcopy(obs)
     for i in np.flatnonzero(dones):
         terminal = infos[i].get("terminal_observation")
-        if terminal is None:  # as SB3's replay buffers take it: some VecEnvs of others do not tell
+        if terminal is None:  # as in SB3's replay buffers: some third-party VecEnvs omit it
             continue
         if isinstance(obs, dict):
             for key in obs:
@@ -84,7 +84,7 @@ def _successors(obs: VecEnvObs, dones: np.ndarray, infos: list[dict[str, Any]]) 
 
 @contextmanager
 def bound(env: VecEnv | None, bonus: BonusFn | None) -> Iterator[None]:
-    """Bind a bonus to the wrapper in a chain, if it has one, for the length of the block."""
+    """Bind a bonus to the wrapper in a chain, if there is one, while the block runs."""
     wrapper = None if env is None else unwrap_vec_wrapper(env, IntrinsicRewardVecEnv)
     if wrapper is None:
         yield
@@ -98,14 +98,14 @@ def bound(env: VecEnv | None, bonus: BonusFn | None) -> Iterator[None]:
 
 def with_intrinsic_reward(env: VecEnv, observation_space: spaces.Space, scale: float) -> VecEnv:
     """
-    Check the order of the wrappers in a chain, and put the wrapper outermost if there is none and one is needed.
+    Check the order of the wrappers in a chain, and add the wrapper as the outermost one if it is needed and missing.
 
-    :param env: the chain of the agent
-    :param observation_space: what the agent sees
+    :param env: the agent's chain of wrappers
+    :param observation_space: the agent's observation space
     :param scale: weight of the bonus; 0: no wrapper is needed
     :return: the chain
-    :raises ValueError: if rewards are normalised on the way, if the wrapper's rewards would be ignored, or if it sees
-        other observations than the agent
+    :raises ValueError: if rewards are normalised, if the wrapper's rewards would be ignored, or if its observations differ
+        from the agent's
     """
     chain, layer = [], env
     while isinstance(layer, VecEnvWrapper):
@@ -116,8 +116,8 @@ def with_intrinsic_reward(env: VecEnv, observation_space: spaces.Space, scale: f
     remedy = "use VecNormalize(IntrinsicRewardVecEnv(venv), norm_reward=False)."
     if normalize is not None and normalize.norm_reward:
         raise ValueError(
-            "VecNormalize(norm_reward=True): it rescales the rewards while they come in, so that neither the metric nor "
-            "reward_range has a fixed unit. Pass norm_reward=False."
+            "VecNormalize(norm_reward=True): it rescales rewards during training, so neither the metric nor reward_range "
+            "has a fixed unit. Pass norm_reward=False."
         )
     if wrapper is not None and normalize is not None and chain.index(wrapper) < chain.index(normalize):
         raise ValueError(f"IntrinsicRewardVecEnv outside of VecNormalize: its rewards would be ignored; {remedy}")
@@ -131,13 +131,13 @@ def with_intrinsic_reward(env: VecEnv, observation_space: spaces.Space, scale: f
     if seen != wanted:
         raise ValueError(
             f"IntrinsicRewardVecEnv sees observations of {seen} numbers, the agent of {wanted}: put it outside of the "
-            "wrapper that changes them (VecFrameStack, for example)."
+            "wrapper that changes their shape, such as VecFrameStack."
         )
     return env
 
 
 def _sizes(space: spaces.Space) -> Any:
-    """How many numbers an observation holds, per key: the same before and after a transposition."""
+    """Size of an observation, per key. A transposition does not change it."""
     if isinstance(space, spaces.Dict):
         return {key: _sizes(subspace) for key, subspace in space.items()}
     return int(np.prod(space.shape or ()))

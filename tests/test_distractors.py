@@ -263,7 +263,7 @@ def test_an_invalid_distractor_argument_is_refused(arguments: dict[str, object],
 
 
 def test_a_single_clip_cannot_be_held_out_from_itself(clips: Path) -> None:
-    with pytest.raises(ValueError, match=r"holds but the file .*0\.mkv"):
+    with pytest.raises(ValueError, match=r"holds only the file .*0\.mkv"):
         make_distractor("video", SIZE, clips / "0.mkv", "eval")
 
 

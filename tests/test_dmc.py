@@ -364,8 +364,8 @@ def test_state_tasks_work_without_opengl_and_pixel_tasks_say_what_to_install() -
     ("wanted", "message"),
     [
         ("", "neither libEGL nor libOSMesa is installed"),
-        ("osmesa", "MUJOCO_GL=osmesa asks for the library libOSMesa, which is missing"),
-        ("disable", "MUJOCO_GL=disable switches drawing off"),
+        ("osmesa", "MUJOCO_GL=osmesa needs the library libOSMesa, which is missing"),
+        ("disable", "MUJOCO_GL=disable disables drawing"),
     ],
 )
 def test_the_error_says_why_nothing_can_be_rendered(monkeypatch: pytest.MonkeyPatch, wanted: str, message: str) -> None:

@@ -213,7 +213,7 @@ def test_a_distracted_scene_keeps_the_contract_of_gymnasium(make: Make) -> None:
         ({"color_distraction": ["easy"]}, r"color_distraction must be None .* got \['easy'\]"),
         ({"color_distraction": "none"}, "color_distraction must be None .* got 'none'"),
         ({"camera_distraction": "easy", "dynamic": 1}, "dynamic must be True or False, got 1"),
-        ({"dynamic": True}, "dynamic=True .* give camera_distraction or color_distraction too, or leave it out"),
+        ({"dynamic": True}, "dynamic=True .* add camera_distraction or color_distraction, or omit it"),
     ],
 )
 def test_a_bad_argument_is_named_with_its_value_and_a_remedy(make: Make, arguments: dict[str, Any], message: str) -> None:

@@ -1,15 +1,15 @@
 """
-Diagnostics of a running :class:`~sb3_robust_bisim.BisimSAC`, for TensorBoard and every other output of SB3's logger.
+Diagnostics of a running :class:`~sb3_robust_bisim.BisimSAC`, for TensorBoard and all other outputs of SB3's logger.
 
-Their arguments are plain values, so that a zoo YAML can name them::
+Their arguments are plain values, so RL Zoo's YAML files can use them::
 
     callback:
       - sb3_robust_bisim.callbacks.EmbeddingCallback
       - sb3_robust_bisim.callbacks.DenoisingFactorCallback: {every: 2000}
       - sb3_robust_bisim.callbacks.ValueBoundCallback: {n_states: 500}
 
-None of them changes the run that it watches: evaluation states come from an environment of their own or from the replay
-buffer, and the global random generators are put back.
+None of them changes the run. The states come from a separate environment or from the replay buffer, and the global random
+generators are restored.
 """
 
 from sb3_robust_bisim.callbacks.denoising import DenoisingFactorCallback

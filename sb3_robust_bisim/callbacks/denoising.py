@@ -1,4 +1,4 @@
-"""Whether the embedding tells states apart, or distractors."""
+"""How well the embedding separates states, compared with how much it reacts to noise."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -12,41 +12,40 @@ from sb3_robust_bisim.callbacks.diagnostic import EnvironmentCallback, Step, emb
 from sb3_robust_bisim.envs.noise import NoiseObservation
 from sb3_robust_bisim.frame_buffer import frames_per_observation
 
-_STRIDE = 4  # steps of the walk from one anchor to the next: neighbours are nearly the same state
+_STRIDE = 4  # steps between two anchors, because neighbours are nearly the same state
 
 
 class DenoisingFactorCallback(EnvironmentCallback):
     """
-    Does the embedding tell states apart, or distractors?
+    Records how well the embedding separates states, compared with how much it reacts to noise.
 
-    Records ``bisim/denoising_factor``, (d_neg - d_pos) / (d_neg + d_pos) in [-1, 1], as the literature defines it: see
-    :func:`denoising_factor`. 1: the noise is gone; 0: it matters as much as the state. The distances are L2 whatever distance
-    the metric loss trains, so that the numbers of two agents, and those in the literature, can be compared.
+    ``bisim/denoising_factor`` is (d_neg - d_pos) / (d_neg + d_pos) in [-1, 1], as defined in the literature; see
+    :func:`denoising_factor`. At 1 the embedding ignores the noise; at 0 the noise matters as much as the state. The distances
+    are L2, independent of the distance that the metric loss trains. The numbers of different agents, and those in the
+    literature, can therefore be compared.
 
-    The anchors are every fourth state of a walk with the present policy. Anchors and positives are noisy alike: each one has
-    noise of its own, drawn by :class:`~sb3_robust_bisim.envs.NoiseObservation` and mixed by its projection; in a stack of
-    frames each frame is drawn again.
+    The anchors are every fourth state of a walk with the current policy. Every anchor and every positive has its own noise,
+    drawn by :class:`~sb3_robust_bisim.envs.NoiseObservation` and mixed by its projection. In a stack of frames, each frame is
+    drawn again.
 
-    Pixel tasks cannot show a state in front of a fresh background yet. There each state has a single positive,
-    ``info["clean_obs"]``, the frame without a distractor, which the task writes if asked to:
-    ``env_kwargs={"clean_obs": True}``. d_pos then holds the effect of one background where the literature's holds that of
-    two, so these numbers do not compare with the literature's.
+    On pixel tasks each state has a single positive, the frame without a distractor. The task provides it as
+    ``info["clean_obs"]`` with ``env_kwargs={"clean_obs": True}``. d_pos then measures the effect of one background, and in the
+    literature that of two, so these numbers cannot be compared with the literature.
 
-    ``eval_env_kwargs`` asks for ``bisim/denoising_factor_heldout`` as well, the same number on noise or backgrounds that the
-    training does not show. It is measured in an environment of its own with the same start states, in which the policy acts
-    on the held-out noise.
+    ``eval_env_kwargs`` adds ``bisim/denoising_factor_heldout``: the same number for noise or backgrounds that training does
+    not use. It is measured in a separate environment with the same start states, where the policy acts on the held-out noise.
 
-    :param every: environment steps of the training between two looks, >= 1
-    :param n_states: anchors, >= 2 (literature: 125)
-    :param env_id: another environment; None: that of the training
-    :param env_kwargs: laid over the arguments of the environment
-    :param seed: of the environment; every look begins with the same start states
+    :param every: environment steps of the training between two measurements, >= 1
+    :param n_states: number of anchors, >= 2 (literature: 125)
+    :param env_id: id of the environment to measure in; None: that of the training
+    :param env_kwargs: merged into the arguments of the environment
+    :param seed: seed of the environment; every measurement begins with the same start states
     :param verbose: as in SB3
-    :param n_positives: looks at each state besides the anchor, >= 1 (literature: 16); pixel tasks have one
-    :param eval_env_kwargs: laid over ``env_kwargs`` for the held-out number, such as ``{"noise_mean": 1.0}`` or
-        ``{"split": "eval"}``; None: no such number
-    :raises ValueError: for an argument outside its range; at the start of training if the observations differ, or for an
-        environment without noise or clean frames
+    :param n_positives: positives per state, >= 1 (literature: 16); pixel tasks have one
+    :param eval_env_kwargs: merged into ``env_kwargs`` for the held-out number, such as ``{"noise_mean": 1.0}`` or
+        ``{"split": "eval"}``; None: no held-out number
+    :raises ValueError: for an argument outside its range; at the start of training if the observation spaces differ, or if
+        the environment has neither noise nor clean frames
 
     Example::
 
@@ -82,12 +81,12 @@ class DenoisingFactorCallback(EnvironmentCallback):
         self._noise = _noise_layer(env)
         if self._noise is None and "clean_obs" not in next(self._walk()).info:
             raise ValueError(
-                f'env_kwargs={self.env_kwargs}: no NoiseObservation and no info["clean_obs"], so no state can be seen with '
-                "other noise. Noisy tasks need noise_multiplier > 0, pixel tasks env_kwargs={'clean_obs': True}."
+                f'env_kwargs={self.env_kwargs}: no NoiseObservation and no info["clean_obs"], so a state cannot be observed '
+                "with different noise. Noisy tasks need noise_multiplier > 0, pixel tasks env_kwargs={'clean_obs': True}."
             )
         if self._noise is not None and self._noise.observation_space != env.observation_space:
             raise ValueError(
-                f"env_id={self.env_id!r}: its observations lie in {env.observation_space}, those of NoiseObservation in "
+                f"env_id={self.env_id!r}: its observation space is {env.observation_space}, that of NoiseObservation is "
                 f"{self._noise.observation_space}. Make NoiseObservation the outermost wrapper that changes observations."
             )
         if self._held_out is not None:
@@ -110,18 +109,18 @@ class DenoisingFactorCallback(EnvironmentCallback):
         return denoising_factor(anchors, th.stack(positives))
 
     def _states(self) -> Iterator[list[np.ndarray]]:
-        """Observations of each state of a walk: the one that the policy acts on, then the positives."""
+        """For each state of a walk: the observation that the policy acts on, then the positives."""
         recent: deque[list[np.ndarray]] = deque(maxlen=frames_per_observation(self.venv))
         for step in self._walk():
             if step.done:
                 recent.clear()
                 continue
             recent.append(self._positives(step))
-            if len(recent) == recent.maxlen:  # before that the stack still holds zeros
+            if len(recent) == recent.maxlen:  # until then the stack contains zeros
                 yield [step.next_obs, *(_stack(frames, step.next_obs.shape) for frames in zip(*recent, strict=True))]
 
     def _positives(self, step: Step) -> list[np.ndarray]:
-        """Single frames of the state that a step led to: with fresh noise, or one without a distractor."""
+        """Single frames of the state after a step: with new noise, or one without a distractor."""
         if self._noise is not None:
             return [self._noise.look() for _ in range(self.n_positives)]
         return [step.info["clean_obs"]]
@@ -129,14 +128,14 @@ class DenoisingFactorCallback(EnvironmentCallback):
 
 def denoising_factor(anchors: th.Tensor, positives: th.Tensor) -> float:
     """
-    (d_neg - d_pos) / (d_neg + d_pos). d_pos is the mean L2 distance of an anchor to the positives of its own state, d_neg that
-    to the positives of all other states.
+    (d_neg - d_pos) / (d_neg + d_pos). d_pos is the mean L2 distance between an anchor and the positives of its own state.
+    d_neg is the mean L2 distance between an anchor and the positives of all other states.
 
     :param anchors: (N, n) embeddings, one for each of N >= 2 states
-    :param positives: (K, N, n) embeddings of the same states with other noise
-    :return: number in [-1, 1]; 0 when all embeddings are one point
+    :param positives: (K, N, n) embeddings of the same states with different noise
+    :return: number in [-1, 1]; 0 if all embeddings are equal
     """
-    # Without matrix products, which would leave equal embeddings a distance of up to a thousandth of their norm
+    # Not with matrix products: they can give equal embeddings a distance of up to a thousandth of their norm
     distances = th.stack([th.cdist(anchors, p, compute_mode="donot_use_mm_for_euclid_dist") for p in positives])
     own_state = th.eye(len(anchors), dtype=th.bool, device=anchors.device)
     positive, negative = distances[:, own_state].mean().item(), distances[:, ~own_state].mean().item()
@@ -147,7 +146,7 @@ def denoising_factor(anchors: th.Tensor, positives: th.Tensor) -> float:
 def _noise_layer(env: Any) -> NoiseObservation | None:
     """
     :param env: outermost wrapper
-    :return: the layer that adds noise, if there is one
+    :return: the wrapper that adds noise, if there is one
     """
     while not isinstance(env, NoiseObservation):
         if not hasattr(env, "env"):
@@ -158,10 +157,10 @@ def _noise_layer(env: Any) -> NoiseObservation | None:
 
 def _stack(frames: tuple[np.ndarray, ...], shape: tuple[int, ...]) -> np.ndarray:
     """
-    Stack as VecFrameStack does, and SB3's transposition of images after it.
+    Stack frames as VecFrameStack does, and transpose images as SB3 does.
 
     :param frames: oldest first
-    :param shape: (1, ...) of the observation that they make
+    :param shape: (1, ...), shape of the resulting observation
     """
     stack = np.concatenate(frames, axis=-1)[None]
     return stack if stack.shape == shape else stack.transpose(0, 3, 1, 2)

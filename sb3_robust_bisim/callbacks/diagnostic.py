@@ -1,4 +1,4 @@
-"""What the diagnostics share: when they look, that they disturb nothing, and an environment of their own."""
+"""Base classes of the diagnostics: when they measure, how they leave the run unchanged, and their separate environment."""
 
 import dataclasses
 from abc import abstractmethod
@@ -20,18 +20,18 @@ from sb3_robust_bisim.bisim_sac import BisimSAC
 from sb3_robust_bisim.encoders import Encoded
 from sb3_robust_bisim.frame_buffer import frames_per_observation
 
-LONGEST_WALK = 100_000  # steps of one look, far more than it takes where episodes end
+LONGEST_WALK = 100_000  # steps of one measurement, far more than it needs if episodes end
 NOT_FOR_FIGURES = ("stdout", "log", "json", "csv")
 
 
 class DiagnosticCallback(BaseCallback):
     """
-    Looks at the model every so often, and at the end of training, without changing the run.
+    Measures the model at regular intervals and at the end of training, without changing the run.
 
-    :param every: environment steps between two looks, all environments together, >= 1
-    :param n_states: states to look at, >= 2
+    :param every: environment steps between two measurements, summed over all environments, >= 1
+    :param n_states: number of states to measure with, >= 2
     :param verbose: as in SB3
-    :raises ValueError: for an argument outside its range; at the start of training for a model that is no BisimSAC
+    :raises ValueError: for an argument outside its range; at the start of training if the model is not a BisimSAC
     """
 
     model: BisimSAC
@@ -47,8 +47,8 @@ class DiagnosticCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         if not isinstance(self.model, BisimSAC):
-            raise ValueError(f"{type(self).__name__} looks at embeddings: it works with BisimSAC, not {type(self.model)}.")
-        if self._last_look is None or self._last_look > self.num_timesteps:  # else a run goes on, from a checkpoint perhaps
+            raise ValueError(f"{type(self).__name__} measures embeddings: it works with BisimSAC, not {type(self.model)}.")
+        if self._last_look is None or self._last_look > self.num_timesteps:  # else a run continues, maybe from a checkpoint
             self._last_look = self.num_timesteps
         with _undisturbed(self.model):
             self._prepare()
@@ -59,7 +59,7 @@ class DiagnosticCallback(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
-        # The zoo calls this also when training has failed or not begun, and then nothing may hide the reason
+        # RL Zoo calls this also if training has failed or not begun; a second error would hide the reason
         if self._steps_since > 0 and all(param.isfinite().all() for param in self.model.policy.parameters()):
             self._look()
 
@@ -71,16 +71,16 @@ class DiagnosticCallback(BaseCallback):
         self._last_look = self.num_timesteps
         with _undisturbed(self.model), th.no_grad():
             self._measure()
-        # as SB3's EvalCallback does it, so that the numbers stand at the step they belong to
+        # as in SB3's EvalCallback, so that the numbers are logged at the step to which they belong
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
 
     def _prepare(self) -> None:
-        """Refuse, before training starts, what would fail later."""
+        """Raise an error before training starts for what would fail later."""
 
     @abstractmethod
     def _measure(self) -> None:
-        """Record to the logger."""
+        """Measure and record to the logger."""
 
     def _record_figure(self, name: str, figure: MatplotlibFigure) -> None:
         self.logger.record(name, Figure(figure, close=False), exclude=NOT_FOR_FIGURES)
@@ -88,16 +88,16 @@ class DiagnosticCallback(BaseCallback):
 
 class EnvironmentCallback(DiagnosticCallback):
     """
-    A diagnostic with an environment of its own: that of the training once more, made from its id, with its VecFrameStack and
-    the present statistics of its VecNormalize, and without any other wrapper that was put around it.
+    A diagnostic with a separate environment. It is made from the id of the training environment, with the same VecFrameStack
+    and the current statistics of VecNormalize. Other wrappers around the training environment are not copied.
 
-    :param every: environment steps of the training between two looks, >= 1
-    :param n_states: states to look at, >= 2
-    :param env_id: another environment; None: that of the training
-    :param env_kwargs: laid over the arguments of the environment
-    :param seed: of the environment; every look begins with the same start states
+    :param every: environment steps of the training between two measurements, >= 1
+    :param n_states: number of states to measure with, >= 2
+    :param env_id: id of the environment to measure in; None: that of the training
+    :param env_kwargs: merged into the arguments of the environment
+    :param seed: seed of the environment; every measurement begins with the same start states
     :param verbose: as in SB3
-    :raises ValueError: for an argument outside its range; at the start of training if the observations differ
+    :raises ValueError: for an argument outside its range; at the start of training if the observation spaces differ
     """
 
     def __init__(
@@ -117,16 +117,16 @@ class EnvironmentCallback(DiagnosticCallback):
 
     @property
     def venv(self) -> VecEnv:
-        assert self._venv is not None  # made when training starts
+        assert self._venv is not None  # created when training starts
         return self._venv
 
     def _prepare(self) -> None:
         self._venv = self._make_env()
         if self.venv.observation_space != self.model.observation_space:
             raise ValueError(
-                f"env_id={self.env_id!r}, env_kwargs={self.env_kwargs}: {type(self).__name__} would see "
-                f"{self.venv.observation_space}, the agent sees {self.model.observation_space}. Give env_kwargs that make "
-                "both the same."
+                f"env_id={self.env_id!r}, env_kwargs={self.env_kwargs}: {type(self).__name__} would observe "
+                f"{self.venv.observation_space}, the agent observes {self.model.observation_space}. Pass env_kwargs that make "
+                "them equal."
             )
 
     def _on_training_end(self) -> None:
@@ -141,10 +141,10 @@ class EnvironmentCallback(DiagnosticCallback):
         spec = training.get_attr("spec")[0] if self.env_id is None else gym.spec(self.env_id)
         if spec is None:
             raise ValueError(
-                f"env_id=None: the environment of the training was not made from an id, so {type(self).__name__} cannot make "
-                "another one. Register it with gymnasium and pass env_id and env_kwargs."
+                f"env_id=None: the training environment was not made from an id, so {type(self).__name__} cannot make "
+                "another one. Register it with gymnasium, and pass env_id and env_kwargs."
             )
-        # what the entry point of the id wraps around comes back by itself, and Monitor cannot be made from its spec
+        # The entry point of the id adds its own wrappers again, and Monitor cannot be made from its spec
         kwargs = {key: value for key, value in spec.kwargs.items() if key != "render_mode"}
         bare = dataclasses.replace(spec, additional_wrappers=(), kwargs={**kwargs, **self.env_kwargs})
         venv: VecEnv = DummyVecEnv([lambda: gym.make(bare)])
@@ -153,7 +153,7 @@ class EnvironmentCallback(DiagnosticCallback):
         return self.model._wrap_env(venv, monitor_wrapper=False)
 
     def _walk(self) -> Iterator["Step"]:
-        """Run the present (stochastic) policy from the same seed on, for as long as somebody asks."""
+        """Yield steps of the current (stochastic) policy; every walk starts from the same seed."""
         self.venv.seed(self.seed)
         obs = self.venv.reset()
         for _ in range(LONGEST_WALK):
@@ -162,7 +162,7 @@ class EnvironmentCallback(DiagnosticCallback):
             yield Step(obs, float(rewards[0]), bool(dones[0]), infos[0], next_obs)
             obs = next_obs
         raise ValueError(
-            f"n_states={self.n_states}: {type(self).__name__} found fewer states to look at in {LONGEST_WALK} steps of "
+            f"n_states={self.n_states}: {type(self).__name__} found fewer states in {LONGEST_WALK} steps of "
             f"{self.venv.get_attr('spec')[0].id}. Its episodes must end (max_episode_steps), and be longer than a frame stack."
         )
 
@@ -171,13 +171,13 @@ class EnvironmentCallback(DiagnosticCallback):
         return obs if normalize is None else normalize.normalize_obs(obs)
 
     def _tensor(self, obs: list[Any]) -> PyTorchObs:
-        """Observations with a leading axis of one, as the encoder takes them."""
+        """Convert observations with a leading axis of one to the encoder's input."""
         rows: Any = {key: np.concatenate([o[key] for o in obs]) for key in obs[0]} if isinstance(obs[0], dict) else None
         return self.model.policy.obs_to_tensor(self._normalize(np.concatenate(obs) if rows is None else rows))[0]
 
 
 class Step(NamedTuple):
-    """One step; observations have a leading axis of one, and at ``done`` the next one belongs to a new episode."""
+    """One step. Observations have a leading axis of one. If ``done``, the next observation belongs to a new episode."""
 
     obs: Any
     reward: float
@@ -188,7 +188,7 @@ class Step(NamedTuple):
 
 def embed(model: BisimSAC, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
     """
-    :param obs: B observations as the networks take them
+    :param obs: B observations, as the networks expect them
     :return: (B, n) embeddings and (B, 1) values, min_k Q_k(s, mean action)
     """
     encoder = model.critic.features_extractor
@@ -199,7 +199,7 @@ def embed(model: BisimSAC, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
 
 @contextmanager
 def _undisturbed(model: BisimSAC) -> Iterator[None]:
-    """Put the global random generators, which SB3 draws from, and the policy's training mode back afterwards."""
+    """Restore the global random generators, which SB3 uses, and the policy's training mode afterwards."""
     numpy_state, training = np.random.get_state(), model.policy.training  # noqa: NPY002
     with th.random.fork_rng([model.device] if model.device.type == "cuda" else []):
         model.policy.set_training_mode(False)

@@ -14,14 +14,14 @@ from sb3_robust_bisim.frame_buffer import frames_per_observation
 
 class EmbeddingCallback(DiagnosticCallback):
     """
-    Shows the embedding: TensorBoard's projector with value and reward of each state, and the frames if the agent sees any;
-    and, under ``embedding/pca``, the plane of the two largest principal components coloured by value.
+    Shows the embedding in TensorBoard. The projector shows each state with its value and reward, and with its frame if the
+    agent observes pixels. ``embedding/pca`` shows the plane of the two largest principal components, coloured by value.
 
-    The states are drawn from the replay buffer. Their value is min_k Q_k(s, mean action).
+    The states are sampled from the replay buffer. Their value is min_k Q_k(s, mean action).
 
-    The arguments are those of :class:`DiagnosticCallback`. A buffer that holds fewer than ``n_states`` shows what it has.
+    The arguments are those of :class:`DiagnosticCallback`. If the buffer has fewer than ``n_states`` states, all are shown.
 
-    :raises ValueError: also at the start of training, without a TensorBoard log
+    :raises ValueError: also at the start of training if there is no TensorBoard log
 
     Example::
 
@@ -32,8 +32,8 @@ class EmbeddingCallback(DiagnosticCallback):
     def _prepare(self) -> None:
         if self._tensorboard() is None:
             raise ValueError(
-                f"tensorboard_log={self.model.tensorboard_log!r}: EmbeddingCallback writes to TensorBoard. Give the model a "
-                "tensorboard_log (on the command line: --tensorboard-log), and install tensorboard."
+                f"tensorboard_log={self.model.tensorboard_log!r}: EmbeddingCallback writes to TensorBoard. Pass "
+                "tensorboard_log to the model (on the command line: --tensorboard-log), and install tensorboard."
             )
 
     def _tensorboard(self) -> TensorBoardOutputFormat | None:
@@ -44,7 +44,7 @@ class EmbeddingCallback(DiagnosticCallback):
         buffer = self.model.replay_buffer
         assert buffer is not None
         n_stored = buffer.size() * buffer.n_envs
-        if isinstance(buffer, HerReplayBuffer):  # draws from episodes that have ended
+        if isinstance(buffer, HerReplayBuffer):  # samples only from finished episodes
             n_stored = int(np.count_nonzero(buffer.ep_length))
         if n_stored < 2:
             return
@@ -63,7 +63,7 @@ class EmbeddingCallback(DiagnosticCallback):
         self._record_figure("embedding/pca", _pca_figure(z, values))
 
     def _sprites(self, obs: PyTorchObs) -> th.Tensor | None:
-        """The newest frame of each stack, (B, 3, H, W) in [0, 1]; None where there are no images."""
+        """The newest frame of each stack, (B, 3, H, W) in [0, 1]; None if there are no images."""
         if isinstance(obs, dict) or not is_image_space(self.model.observation_space):
             return None
         in_colour = obs.shape[1] == 3 * frames_per_observation(self.training_env)

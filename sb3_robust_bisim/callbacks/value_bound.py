@@ -1,4 +1,4 @@
-"""Whether learned distances bound differences of value."""
+"""How often learned distances bound differences of value."""
 
 from typing import Any
 
@@ -11,22 +11,24 @@ from sb3_robust_bisim.losses import pairwise_distance
 
 class ValueBoundCallback(EnvironmentCallback):
     """
-    Do learned distances bound differences of value, as thm:generalized-ct says that the exact metric does?
+    Records how often learned distances bound differences of value. By thm:generalized-ct, the exact metric always does.
 
-    Runs episodes of the present policy, takes the discounted return of what is left of the episode as the value of a state
-    (after a time-out the critic's value of the last state stands for the rest), and compares the gap of every pair of states
-    with their distance d / c_R + 2 (R_max - R_min) (gamma - c_T) / ((1 - gamma) (1 - c_T)), the second term for c_T < gamma
-    only. Records ``bisim/value_bound_violations``, the fraction of pairs whose gap is larger; the means
-    ``bisim/value_gap`` and ``bisim/value_bound``; and the scatter ``bisim/value_gap_against_bound``.
+    The callback runs episodes of the current policy. The value of a state is the discounted return of the rest of its episode;
+    after a time-out, the critic's value of the last state replaces the missing part. For every pair of states, the
+    difference of their values is compared with the bound
+    d / c_R + 2 (R_max - R_min) (gamma - c_T) / ((1 - gamma) (1 - c_T)), whose second term applies only if c_T < gamma.
 
-    The theorem is about expected returns; a single return of a random task scatters around its own. The returns are the
-    environment's; with a bonus the metric has been trained on larger rewards than these. The distance is what the
-    metric loss trains; ``huber`` is averaged over coordinates and no metric, so it may break the bound at any time.
+    ``bisim/value_bound_violations`` is the fraction of pairs whose difference exceeds the bound. ``bisim/value_gap`` and
+    ``bisim/value_bound`` are the means of both, and ``bisim/value_gap_against_bound`` is a scatter plot.
 
-    The arguments are those of :class:`EnvironmentCallback`; whole episodes are run until there are ``n_states`` states.
-    Another environment should pay the reward that the agent was trained on.
+    The theorem is about expected returns, while a single return of a stochastic task varies. The returns do not include the
+    intrinsic reward, while the metric was trained with it. The distance is the one that the metric loss trains. ``huber`` is
+    averaged over coordinates and is not a metric, so it can violate the bound at any time.
 
-    :raises ValueError: also at the start of training, for ``c_r=0`` or ``gamma=1``, for which there is no bound
+    The arguments are those of :class:`EnvironmentCallback`. Complete episodes are run until there are ``n_states`` states. An
+    environment given by ``env_id`` should have the rewards that the agent was trained with.
+
+    :raises ValueError: also at the start of training if ``c_r=0`` or ``gamma=1``, because there is no bound then
     :raises ImportError: without the extra ``theory``
 
     Example::
@@ -36,7 +38,7 @@ class ValueBoundCallback(EnvironmentCallback):
     """
 
     def _prepare(self) -> None:
-        from sb3_robust_bisim.theory.bounds import value_difference_bound  # the one callback that needs the extra
+        from sb3_robust_bisim.theory.bounds import value_difference_bound  # the only callback that needs the extra
 
         self._bound = value_difference_bound
         if self.model.c_r == 0 or self.model.gamma == 1:
@@ -45,7 +47,7 @@ class ValueBoundCallback(EnvironmentCallback):
 
     def _measure(self) -> None:
         obs, returns = self._returns()
-        keep = np.linspace(0, len(obs) - 1, self.n_states).astype(int)  # of all the episodes, the last one too
+        keep = np.linspace(0, len(obs) - 1, self.n_states).astype(int)  # evenly from all episodes
         z, _ = embed(self.model, self._tensor([obs[i] for i in keep]))
         first, second = np.triu_indices(len(keep), 1)
         distance = pairwise_distance(z[first], z[second], self.model.distance).mean(dim=1).cpu().double().numpy()
@@ -58,7 +60,7 @@ class ValueBoundCallback(EnvironmentCallback):
         self._record_figure("bisim/value_gap_against_bound", _bound_figure(bound, gap))
 
     def _returns(self) -> tuple[list[Any], np.ndarray]:
-        """Observations of whole episodes and the discounted returns that followed them."""
+        """Observations of complete episodes, and the discounted return after each of them."""
         observations: list[Any] = []
         returns: list[float] = []
         rewards: list[float] = []

@@ -1,7 +1,7 @@
 """
-Environments of the paper. Importing this package registers their ids with Gymnasium.
+The tasks. Importing this package registers their ids with Gymnasium.
 
-A worker process that has not imported it knows the ids by their long form, as any Gymnasium id:
+A worker process that has not imported it needs the long form of an id, which imports it:
 ``sb3_robust_bisim.envs:robust_bisim/SparseCartPole-v0``.
 """
 
@@ -12,7 +12,7 @@ from sb3_robust_bisim.envs.noise import NoiseObservation
 
 __all__ = ["NoiseObservation"]
 
-# No reward_threshold for the sparse tasks: they are judged with the arguments of the evaluation, not with the defaults
+# No reward_threshold for the sparse tasks: they are evaluated with other arguments than the defaults
 register("robust_bisim/SparseCartPole-v0", "sb3_robust_bisim.envs.classic:sparse_cart_pole", max_episode_steps=200)
 register("robust_bisim/SparsePendulum-v0", "sb3_robust_bisim.envs.classic:sparse_pendulum", max_episode_steps=200)
 register(

@@ -1,4 +1,4 @@
-"""Cameras that stay: frames of a dm_control physics, as dm_control draws them or keyed for a background."""
+"""Reusable cameras: frames of a dm_control physics, as dm_control draws them or with a replaced background."""
 
 import math
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ from dm_control.mujoco import wrapper
 from sb3_robust_bisim.envs.opengl import rendering_contexts
 from sb3_robust_bisim.envs.scene import CameraPose, Distraction
 
-# What is drawn beyond the objects themselves. Off for the key; the fog would tint the objects.
+# Everything that is drawn besides the objects. Off if the background is replaced; fog would tint the objects.
 _EFFECTS = (
     mujoco.mjtRndFlag.mjRND_SHADOW,
     mujoco.mjtRndFlag.mjRND_REFLECTION,
@@ -20,7 +20,7 @@ _EFFECTS = (
     mujoco.mjtRndFlag.mjRND_HAZE,
     mujoco.mjtRndFlag.mjRND_FOG,
 )
-# The last of the groups by which MuJoCo shows and hides geoms is hidden unless asked for.
+# MuJoCo shows and hides geoms by group. The last group is hidden by default.
 _HIDDEN_GROUP = mujoco.mjNGROUP - 1
 
 
@@ -29,7 +29,7 @@ def camera_index(physics: Any, camera_id: int | str) -> int:
     :param physics: a dm_control physics
     :param camera_id: number or name of a camera of the model
     :return: its number
-    :raises ValueError: when the model has no such camera
+    :raises ValueError: if the model has no such camera
     """
     names = [physics.model.id2name(index, "camera") for index in range(physics.model.ncam)]
     if isinstance(camera_id, str) and camera_id in names:
@@ -41,18 +41,18 @@ def camera_index(physics: Any, camera_id: int | str) -> int:
 
 def make_camera_pose(physics: Any, camera_id: int | str, scale: float, dynamic: bool, upper_quadrant: bool) -> CameraPose:
     """
-    Measure, in the reference pose of the model, from where a camera looks at what.
+    Measure position and target of a camera in the reference pose of the model.
 
-    It looks at the centre of mass of the body that it tracks, else of everything. A camera that looks ahead from a body turns
-    around a point at a distance of the model's extent.
+    The target is the centre of mass of the body that the camera tracks, or of the whole scene. A camera that looks ahead from
+    a body turns around a point in front of it, at the distance of the model's extent.
 
     :param physics: a dm_control physics
     :param camera_id: number or name of a camera of the model
     :param scale: see :class:`~sb3_robust_bisim.envs.scene.CameraPose`
     :param dynamic: see :class:`~sb3_robust_bisim.envs.scene.CameraPose`
-    :param upper_quadrant: keep to the upper quadrant; False for the reacher
-    :return: what moves the camera
-    :raises ValueError: when the model has no such camera
+    :param upper_quadrant: stay in the upper quadrant; False for the reacher
+    :return: the random pose of the camera
+    :raises ValueError: if the model has no such camera
     """
     camera, model = camera_index(physics, camera_id), physics.model.ptr
     data = mujoco.MjData(model)
@@ -66,18 +66,18 @@ def make_camera_pose(physics: Any, camera_id: int | str, scale: float, dynamic: 
 
 class Camera:
     """
-    A view that keeps its scene and its buffers between frames; ``physics.render`` builds both anew for each.
+    A camera that keeps its scene and its buffers between frames. ``physics.render`` builds both for every frame.
 
-    The frames equal those of ``physics.render``, pixel by pixel, unless ``effects`` is off: no shadows, no reflections and no
-    multisampling are then drawn, which a processor without a GPU spends nearly all its time on.
+    The frames equal those of ``physics.render``, pixel by pixel, unless ``effects`` is off. Shadows, reflections and
+    multisampling are then not drawn; without a GPU they take nearly all the time.
 
     :param physics: a dm_control physics
     :param camera_id: number or name of a camera of the model
-    :param max_size: largest height and width that will be asked for, in pixels
+    :param max_size: largest height and width of a frame in pixels
     :param effects: draw shadows, reflections and smooth edges
-    :param own_context: hold an OpenGL context of its own, needed beside a camera with other ``effects``, as it fixes them;
-        otherwise it is the one that the physics makes when it is first asked for
-    :raises ValueError: when the model has no such camera
+    :param own_context: use a separate OpenGL context instead of the one of the physics. It is needed next to a camera with
+        other ``effects``, because a context fixes them
+    :raises ValueError: if the model has no such camera
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class Camera:
         self._option = wrapper.MjvOption()
         self._perturb = wrapper.MjvPerturb()
         self._buffers: dict[int, np.ndarray] = {}
-        # MuJoCo reads these when it makes a context: the size of its frame buffer and how much memory the effects get
+        # MuJoCo reads these when it creates a context: the size of the frame buffer, and the memory for the effects
         physics.model.vis.global_.offwidth = physics.model.vis.global_.offheight = max_size
         if not effects:
             physics.model.vis.quality.offsamples = physics.model.vis.quality.shadowsize = 0
@@ -103,16 +103,16 @@ class Camera:
 
     def frame(self, size: int, distraction: Distraction | None = None) -> np.ndarray:
         """
-        Draw the present state.
+        Draw the current state.
 
         :param size: height and width in pixels, at most ``max_size``
-        :param distraction: what moves the camera and paints the scene, if anything shall; its background is not drawn
+        :param distraction: moves the camera and changes the colours; its background is not drawn
         :return: new contiguous uint8 array of shape (size, size, 3)
         """
         return np.ascontiguousarray(self._draw(size, distraction)[::-1])
 
     def close(self) -> None:
-        """Free the context of its own; the camera must not be used afterwards."""
+        """Free the separate context. The camera must not be used afterwards."""
         if self._own_context is not None:
             self._own_context.free()
 
@@ -130,7 +130,7 @@ class Camera:
         """
         :param size: height and width in pixels
         :param distraction: see :meth:`frame`
-        :return: uint8 array of shape (size, size, 3), bottom row first, that the next call overwrites
+        :return: uint8 array of shape (size, size, 3), bottom row first; the next call overwrites it
         """
         self._update_scene(distraction)
         if size not in self._buffers:
@@ -148,17 +148,17 @@ class Camera:
 
 class KeyCamera(Camera):
     """
-    A view in which a distractor takes the place of the sky and of all planes: the ground and the walls.
+    A camera that replaces the sky and all planes (ground and walls) by a distractor.
 
-    Neither is drawn, nor anything that would mix an object's colour with theirs, so that the pixels that no object covers stay
-    black, and those alone. A key on colour, by contrast, eats blue objects and leaves a fringe around the others. A height
-    field (the terrain of ``quadruped-escape``) is an object: it hides what lies behind it.
+    Sky and planes are not drawn, and neither is anything that mixes their colours with an object's. Exactly the pixels that no
+    object covers are therefore black. Detecting the background by its colour instead would remove blue objects and leave a
+    fringe around the others. A height field (the terrain of ``quadruped-escape``) is an object and hides what is behind it.
 
     :param physics: a dm_control physics
     :param camera_id: number or name of a camera of the model
-    :param max_size: largest height and width that will be asked for, in pixels
+    :param max_size: largest height and width of a frame in pixels
     :param own_context: see :class:`Camera`
-    :raises ValueError: when the model has no such camera
+    :raises ValueError: if the model has no such camera
     """
 
     def __init__(self, physics: Any, camera_id: int | str, max_size: int, *, own_context: bool = False) -> None:
@@ -170,10 +170,10 @@ class KeyCamera(Camera):
 
     def frame(self, size: int, distraction: Distraction | None = None) -> np.ndarray:
         """
-        Draw the present state in front of the present picture of the background.
+        Draw the current state in front of the current background picture.
 
         :param size: height and width in pixels, at most ``max_size``
-        :param distraction: has a background, whose picture is scaled to the size of the frame, without smoothing
+        :param distraction: must have a background; its picture is scaled to the size of the frame, without smoothing
         :return: new contiguous uint8 array of shape (size, size, 3)
         """
         assert distraction is not None
@@ -194,11 +194,11 @@ class KeyCamera(Camera):
 @contextmanager
 def _moved(data: Any, camera: int, pose: CameraPose) -> Iterator[None]:
     """
-    Move a camera, wherever tracking has put it, for the length of a ``with`` block.
+    Move a camera from where it currently is (it may track a body), during a ``with`` block.
 
     :param data: ``mujoco.MjData``
-    :param camera: its number
-    :param pose: where to
+    :param camera: number of the camera
+    :param pose: the pose to apply
     """
     position, axes = data.cam_xpos[camera], data.cam_xmat[camera]
     usual = position.copy(), axes.copy()

@@ -1,9 +1,9 @@
 """
-The Gym tasks of the paper (appendix "OpenAI Gym"). Dynamics, reset and rendering are Gymnasium's; only what the paper changes
-is written here.
+The Gym tasks of the paper (appendix "OpenAI Gym"). Dynamics, reset and rendering are Gymnasium's. This file contains only what
+the paper changes.
 
-To go on exactly where an environment stood, pickle or copy it: the physical state, the random generators (that of the noise
-included) and the time limit are all in it.
+A pickled or copied environment continues exactly where the original was. It contains the physical state, the random generators
+(also that of the noise) and the time limit.
 """
 
 import math
@@ -23,11 +23,11 @@ _FULL_PUSH = np.ones(1, dtype=np.float32)
 
 
 class _ClassicTask(gym.Env[np.ndarray, np.ndarray]):
-    """What the three tasks share: a check of the action, and pickling after rendering."""
+    """Common parts of the three tasks: a check of the action, and pickling after rendering."""
 
     def __getstate__(self) -> dict[str, Any]:
         """
-        :return: the attributes without pygame's surfaces and clock: they cannot be pickled or copied, and ``render`` makes new
+        :return: the attributes without pygame's surfaces and clock, which cannot be pickled or copied; ``render`` creates new
             ones
         """
         state = {name: value for name, value in self.__dict__.items() if name != "surf"}
@@ -35,7 +35,7 @@ class _ClassicTask(gym.Env[np.ndarray, np.ndarray]):
 
     def _check_action(self, action: np.ndarray) -> None:
         """
-        :param action: what the agent passed to ``step``
+        :param action: the argument of ``step``
         :raises ValueError: unless it is one finite number in an array of shape (1,)
         """
         if np.shape(action) != (1,) or not math.isfinite(action[0]):
@@ -49,25 +49,25 @@ class SparseCartPoleEnv(_ClassicTask, CartPoleEnv):
     """
     Cart-pole with a continuous force, rewarded only close to upright and to the middle (paper: "Sparse Noisy Cartpole").
 
-    The action in [-1, 1] (values beyond are clipped) is the fraction of 30 N with which the cart is pushed. The dynamics, the
-    start, the observation (cart position in m, its velocity, pole angle in rad, its velocity) and the end of an episode
-    (|theta| > 12 deg or |x| > 2.4 m) are those of Gymnasium's CartPole; the id adds the limit of 200 steps of CartPole-v0.
+    The action in [-1, 1] (other values are clipped) is the force on the cart as a fraction of 30 N. The dynamics, the start,
+    the observation (cart position in m, its velocity, pole angle in rad, its velocity) and the end of an episode
+    (|theta| > 12 deg or |x| > 2.4 m) are those of Gymnasium's CartPole. The id adds the limit of 200 steps of CartPole-v0.
 
-    A step pays 1 when the state that it leads to has |theta| <= theta_rew_fraction * 12 deg and
-    |x| <= x_rew_fraction * 2.4 m, and 0 otherwise. The step that ends an episode by failing pays 1 at every setting, as
-    CartPole's does, so at ``theta_rew_fraction=1`` the rewards are exactly CartPole-v0's and a return is at most 200: the task
-    in which the paper evaluates. The paper's text speaks of theta alone; the shrunken range of x and the pay for the failing
-    step are what its published code does.
+    The reward of a step is 1 if the next state has |theta| <= theta_rew_fraction * 12 deg and |x| <= x_rew_fraction * 2.4 m,
+    and 0 otherwise. The step that ends an episode by failing has reward 1 in any case, as in CartPole. With
+    ``theta_rew_fraction=1`` the rewards are therefore exactly CartPole-v0's, and a return is at most 200. The paper evaluates
+    in this task. Its text mentions only theta; the condition on x and the reward for the failing step follow its published
+    code.
 
-    :param theta_rew_fraction: rewarded part of the 12 degrees, in (0, 1] (paper: 0.01 for training, 1 for evaluation)
-    :param x_rew_fraction: rewarded part of the 2.4 m, in (0, 1]; None means as ``theta_rew_fraction`` (published code) and 1
-        leaves x free (paper's text)
+    :param theta_rew_fraction: rewarded fraction of the 12 degrees, in (0, 1] (paper: 0.01 for training, 1 for evaluation)
+    :param x_rew_fraction: rewarded fraction of the 2.4 m, in (0, 1]; None: as ``theta_rew_fraction`` (published code);
+        1: no condition on x (paper's text)
     :param render_mode: None, "human" or "rgb_array"
     :raises ValueError: for a fraction outside (0, 1]
     """
 
     max_force = 30.0  # N
-    state: np.ndarray  # CartPole refuses a step before reset, the only time when it is None
+    state: np.ndarray  # None only before the first reset, when CartPole raises an error on a step
 
     def __init__(
         self, theta_rew_fraction: float = 0.01, x_rew_fraction: float | None = None, render_mode: str | None = None
@@ -88,10 +88,10 @@ class SparseCartPoleEnv(_ClassicTask, CartPoleEnv):
 
         :param action: fraction of 30 N, array of shape (1,)
         :return: observation of shape (4,), reward 0 or 1, terminated, truncated (always False here), info
-        :raises ValueError: when the action is not one finite number
+        :raises ValueError: if the action is not one finite number
         """
         self._check_action(action)
-        # CartPole pushes with all of force_mag to the right for action 1: a signed force_mag makes that any force
+        # CartPole's action 1 pushes with force_mag to the right, so a signed force_mag gives any force
         self.force_mag = self.max_force * min(max(float(action[0]), -1.0), 1.0)
         observation, standard_reward, terminated, truncated, info = super().step(_FULL_PUSH)
         x, _, theta, _ = self.state
@@ -101,14 +101,14 @@ class SparseCartPoleEnv(_ClassicTask, CartPoleEnv):
 
 class SparsePendulumEnv(_ClassicTask, PendulumEnv):
     """
-    Pendulum swing-up that pays 1 while the pendulum stands upright and nothing else (paper: "Sparse Pendulum").
+    Pendulum swing-up whose reward is 1 while the pendulum is upright, and 0 otherwise (paper: "Sparse Pendulum").
 
     Dynamics, start, observation (cos theta, sin theta, velocity in rad/s) and action (torque in [-2, 2] N m, clipped) are
-    those of Gymnasium's Pendulum-v1; the id adds its limit of 200 steps. The angle is judged, wrapped to [-180, 180) degrees,
-    in the state that the step leads to. Pendulum-v1 prices the state before the step; judged after it, as in cart-pole, the
-    reward belongs to what the action did, and the last state of an episode counts while the random first one does not.
+    those of Gymnasium's Pendulum-v1; the id adds its limit of 200 steps. The reward depends on the angle after the step,
+    wrapped to [-180, 180) degrees. Pendulum-v1 uses the angle before the step. With the angle after the step, as in cart-pole,
+    the reward is a consequence of the action, and the last state of an episode counts instead of the random first one.
 
-    :param tolerance_degrees: the reward is 1 where |theta| is smaller than this, in (0, 180] (paper: 1 or less for training,
+    :param tolerance_degrees: the reward is 1 if |theta| is smaller than this, in (0, 180] (paper: 1 or less for training,
         1 for evaluation)
     :param render_mode: None, "human" or "rgb_array"
     :raises ValueError: for a tolerance outside (0, 180]
@@ -155,7 +155,7 @@ class MountainCarContinuousEnv(_ClassicTask, Continuous_MountainCarEnv):
         """
         self._check_action(action)
         observation, reward, terminated, truncated, info = super().step(action)
-        # Gymnasium hands out its own state array: an agent that scales observations in place would move the car
+        # Gymnasium returns its own state array: an agent that scales observations in place would move the car
         return observation.copy(), reward, terminated, truncated, info
 
 

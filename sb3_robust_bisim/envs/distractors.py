@@ -1,4 +1,4 @@
-"""Pictures that take the place of the background and have nothing to do with the task."""
+"""Pictures that replace the background and are irrelevant to the task."""
 
 from abc import abstractmethod
 from functools import partial
@@ -12,8 +12,8 @@ from sb3_robust_bisim.envs.video import SplitClipFiles, check_split, load_clip, 
 
 class Distractor(RandomSequence):
     """
-    A sequence of background pictures. A new kind is one subclass with this argument (or one of :class:`ClipDistractor`, which
-    takes files) and one entry of :data:`DISTRACTORS`.
+    A sequence of background pictures. A new kind is one subclass with this argument (or a subclass of :class:`ClipDistractor`,
+    which takes files) and one entry of :data:`DISTRACTORS`.
 
     :param size: height and width of the pictures in pixels
     """
@@ -25,12 +25,12 @@ class Distractor(RandomSequence):
     @property
     @abstractmethod
     def frame(self) -> np.ndarray:
-        """The present picture: uint8 array of shape (size, size, 3), not to be written to."""
+        """The current picture: uint8 array of shape (size, size, 3). Do not write to it."""
 
 
 class ColorDistractor(Distractor):
     """
-    One colour, drawn uniformly for each episode.
+    One colour per episode, uniformly distributed.
 
     :param size: height and width of the pictures in pixels
     """
@@ -60,8 +60,8 @@ class ColorDistractor(Distractor):
 
 class NoiseDistractor(Distractor):
     """
-    Gaussian noise, fresh at every step: clip(255 N(0, 1), 0, 255) in every channel of every pixel, as strong as in the
-    literature. Half of the numbers are 0 and one in six is 255; their mean is 80.
+    Gaussian noise, new at every step: clip(255 N(0, 1), 0, 255) in every channel of every pixel, as strong as in the
+    literature. Half of the values are 0 and one in six is 255; the mean is 80.
 
     :param size: height and width of the pictures in pixels
     """
@@ -84,12 +84,11 @@ class NoiseDistractor(Distractor):
 
 class ClipDistractor(Distractor):
     """
-    Video from files: each episode plays a random clip from a random frame on, and begins it again where it ends.
+    Video from files: each episode plays a random clip in a loop, starting at a random frame.
 
     :param size: height and width of the pictures in pixels
-    :param files: see :func:`~sb3_robust_bisim.envs.video.split_clips`; all of them, of either split, are decoded
-        at once
-    :param split: "train" or "eval": which of the files to play
+    :param files: see :func:`~sb3_robust_bisim.envs.video.split_clips`; the files of both splits are decoded immediately
+    :param split: "train" or "eval": the files to play
     :param grayscale: play without colour
     :param cache_dir: see :func:`~sb3_robust_bisim.envs.video.cache_folder`
     :raises ValueError: for an argument outside its range, or a file that is missing, empty or broken
@@ -109,10 +108,10 @@ class ClipDistractor(Distractor):
         paths = split_clips(files)
         if not paths[split]:
             raise ValueError(
-                f"distractor_files holds but the file {str(paths['train'][0])!r}, so none can be held out for split='eval'; "
-                "give a second one, or a mapping {'train': ..., 'eval': ...}"
+                f"distractor_files holds only the file {str(paths['train'][0])!r}, so none can be held out for split='eval'; "
+                "add a second one, or pass a mapping {'train': ..., 'eval': ...}"
             )
-        # Those of the other split too: a broken one should not wait for the evaluation to be found
+        # Load both splits, so that a broken file is found before the evaluation
         everything = [*paths["train"], *paths["eval"]]
         self._load = partial(load_clip, size=size, grayscale=grayscale, cache_dir=cache_dir)
         clips = {path: self._load(path) for path in everything}
@@ -122,7 +121,7 @@ class ClipDistractor(Distractor):
         self._position = 0
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_clips": None}  # they lie in the cache
+        return {**self.__dict__, "_clips": None}  # they are in the cache
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -143,7 +142,7 @@ class ClipDistractor(Distractor):
 
 class ImageDistractor(ClipDistractor):
     """
-    Still images: each episode shows a random frame of a random file, which may be a video or a picture.
+    Still images: each episode shows a random frame of a random file. A file can be a video or a picture.
 
     The arguments are those of :class:`ClipDistractor`.
     """
@@ -154,18 +153,18 @@ class ImageDistractor(ClipDistractor):
 
 class BallsDistractor(Distractor):
     """
-    Coloured balls that attract each other and bounce off the edges of the picture (an n-body simulation), in front of black.
+    Coloured balls on black that attract each other and bounce off the edges of the picture (an n-body simulation).
 
-    The picture is a unit square. Masses grow with the square of the radius; the balls pass through each other.
+    The picture is a unit square. Masses are proportional to the squared radius. The balls pass through each other.
 
     :param size: height and width of the pictures in pixels
     :param count: number of balls
     """
 
     _radius_range = (0.06, 0.14)  # in widths of the picture
-    _start_speed = 0.02  # standard deviation of each component, widths per step
-    _gravity = 4e-4  # acceleration of two balls at distance 1, per unit of mass, widths per step^2
-    _softening = 0.1  # distance, in widths, within which the attraction fades, as balls are not points
+    _start_speed = 0.02  # standard deviation of each component, in widths per step
+    _gravity = 4e-4  # acceleration at distance 1 per unit of mass, in widths per step^2
+    _softening = 0.1  # distance, in widths, below which the attraction fades, because balls are not points
 
     def __init__(self, size: int, count: int = 8) -> None:
         super().__init__(size)
@@ -203,7 +202,7 @@ class BallsDistractor(Distractor):
         return frame
 
 
-# What ``distractor=...`` of a task may be. Names, checks and error messages come from here.
+# Values of the argument ``distractor`` of a task. Names, checks and error messages follow from this mapping.
 DISTRACTORS: dict[str, type[Distractor] | None] = {
     "none": None,
     "color": ColorDistractor,
@@ -216,13 +215,13 @@ DISTRACTORS: dict[str, type[Distractor] | None] = {
 
 def check_distractor(name: str, files: SplitClipFiles | None, split: str, grayscale: bool) -> None:
     """
-    Check the arguments that need no file to be opened.
+    Check all arguments that can be checked without opening a file.
 
     :param name: a key of :data:`DISTRACTORS`
     :param files: see :class:`ClipDistractor`; only for distractors from files
-    :param split: "train" or "eval"; without meaning for distractors that take no files
+    :param split: "train" or "eval"; ignored by distractors that take no files
     :param grayscale: see :class:`ClipDistractor`; only for distractors from files
-    :raises ValueError: for an argument outside its range, or one that the distractor would ignore
+    :raises ValueError: for an argument outside its range, or files or grayscale for a distractor that takes none
     """
     if name not in tuple(DISTRACTORS):
         raise ValueError(f"distractor must be one of {tuple(DISTRACTORS)}, got {name!r}")
@@ -233,7 +232,7 @@ def check_distractor(name: str, files: SplitClipFiles | None, split: str, graysc
     for argument, value, default in (("distractor_files", files, None), ("grayscale", grayscale, False)):
         if value != default:
             raise ValueError(
-                f"{argument} is only for the distractors {from_files}, got {value!r} for {name!r}: leave it out, or choose one"
+                f"{argument} is only for the distractors {from_files}, got {value!r} for {name!r}: omit it, or choose one"
             )
 
 
@@ -247,17 +246,16 @@ def make_distractor(
     cache_dir: str | None = None,
 ) -> Distractor | None:
     """
-    Build a distractor by its name.
+    Create a distractor by name.
 
     :param name: a key of :data:`DISTRACTORS`
     :param size: height and width of the pictures in pixels
     :param files: see :class:`ClipDistractor`
-    :param split: "train" or "eval"; without meaning for distractors that take no files
+    :param split: "train" or "eval"; ignored by distractors that take no files
     :param grayscale: see :class:`ClipDistractor`
     :param cache_dir: see :class:`ClipDistractor`
     :return: the distractor; None for "none"
-    :raises ValueError: for an argument outside its range or without meaning for the distractor, or a file that is missing,
-        empty or broken
+    :raises ValueError: see :func:`check_distractor`; also for a file that is missing, empty or broken
     """
     check_distractor(name, files, split, grayscale)
     kind = DISTRACTORS[name]

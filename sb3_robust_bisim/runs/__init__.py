@@ -1,4 +1,4 @@
-"""Runs that survive interruptions: exact checkpoints, and files that appear whole or not at all."""
+"""Runs that survive interruptions: exact checkpoints, and files that are written completely or not at all."""
 
 from sb3_robust_bisim.runs.checkpoint import Checkpoint, load_checkpoint, read_about, save_checkpoint
 

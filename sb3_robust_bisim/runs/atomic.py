@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Files that are written completely or not at all."""
 
 import io
 import os
@@ -13,16 +13,16 @@ PathOrStream = str | Path | io.BufferedIOBase
 @contextmanager
 def atomic_path(path: str | os.PathLike[str], alone: bool = False) -> Iterator[Path]:
     """
-    A temporary path beside ``path``, renamed to it when the block ends well and removed when it does not.
+    Yield a temporary path next to ``path``. It is renamed to ``path`` if the block succeeds, and removed otherwise.
 
-    :param path: where the file shall be; missing parent folders are created
-    :param alone: nobody else writes this file: the temporary one always has the same name, so that what a kill has left is
-        written over and does not pile up
+    :param path: the file to write; missing parent folders are created
+    :param alone: True if no other process writes this file. The temporary file then always has the same name, so the next
+        write replaces the leftover of a killed process
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    writer = "" if alone else f".{uuid.uuid4().hex}"  # process ids repeat, between threads and between machines
-    temporary = target.with_name(f".{target.stem}{writer}.tmp{target.suffix}")  # writers choose formats by suffix
+    writer = "" if alone else f".{uuid.uuid4().hex}"  # process ids are not unique across threads and machines
+    temporary = target.with_name(f".{target.stem}{writer}.tmp{target.suffix}")  # some writers choose the format by the suffix
     try:
         yield temporary
         os.replace(temporary, target)
@@ -33,10 +33,10 @@ def atomic_path(path: str | os.PathLike[str], alone: bool = False) -> Iterator[P
 @contextmanager
 def atomic_save(path: PathOrStream, suffix: str) -> Iterator[Path | io.BufferedIOBase]:
     """
-    ``atomic_path`` for what SB3's ``save`` methods take.
+    ``atomic_path`` for the arguments of SB3's ``save`` methods.
 
-    :param path: a stream is handed on as it is
-    :param suffix: what SB3 adds to a path that has none, ".zip" for example
+    :param path: path or stream; a stream is passed on unchanged
+    :param suffix: suffix that SB3 adds to a path without one, such as ".zip"
     """
     if not isinstance(path, (str, os.PathLike)):
         yield path

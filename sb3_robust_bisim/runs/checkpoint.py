@@ -1,12 +1,11 @@
 """
-Checkpoints from which training goes on as if it had never stopped.
+Checkpoints from which training continues as if it had never stopped.
 
-SB3's own ``save`` keeps the agent. Here everything goes into one file that the next number depends on: agent and optimizers,
-replay buffer, environments in the middle of their episodes, callbacks with what they have gathered, and the random generators
-(of CPU and CUDA).
-Learning then gives the same numbers, bit by bit, as a run that was never interrupted. What differs: the wall-clock times;
-the first line of every output of SB3's logger, whose means begin anew; and with ``use_sde`` or action noise the exploration,
-whose noise SB3 draws anew whenever ``learn`` is called.
+SB3's own ``save`` stores the agent. A checkpoint stores everything that influences later numbers in one file: agent and
+optimizers, replay buffer, environments in the middle of their episodes, callbacks with their state (if they are part of
+``context``), and the random generators of CPU and CUDA. A run that continues computes the same numbers, bit by bit, as a run
+without interruption. Three things differ: wall-clock times; the first line of every output of SB3's logger, because its means
+start again; and exploration with ``use_sde`` or action noise, because SB3 draws new noise in every call of ``learn``.
 """
 
 import inspect
@@ -35,20 +34,20 @@ from sb3_robust_bisim.runs.atomic import atomic_path
 
 class Checkpoint(BaseCallback):
     """
-    Writes a checkpoint every so often, between two rollouts, over the one before.
+    Writes checkpoints at regular intervals, between two rollouts. Each one replaces the previous one.
 
-    :param path: file to write; it is replaced as a whole
-    :param every: environment steps between two checkpoints, all environments together, >= 1
-    :param context: anything else to keep, under the same roof: objects shared with the model stay shared
-    :param about: plain values that :func:`read_about` finds without unpickling anything else
-    :raises ValueError: for ``every`` < 1; at the start of training, for environments that cannot be kept (see
+    :param path: file to write; it is replaced completely or not at all
+    :param every: environment steps between two checkpoints, summed over all environments, >= 1
+    :param context: other objects to save in the same file. Objects that they share with the model stay shared
+    :param about: plain values that :func:`read_about` returns without unpickling the rest
+    :raises ValueError: for ``every`` < 1; at the start of training, for environments that cannot be saved (see
         :func:`save_checkpoint`)
     """
 
     def __init__(self, path: str | Path, every: int, context: Any = None, about: dict[str, Any] | None = None) -> None:
         super().__init__()
         if every < 1:
-            raise ValueError(f"every={every}: there must be at least one step between two checkpoints.")
+            raise ValueError(f"every={every}: must be at least 1.")
         self.path = Path(path)
         self.every = every
         self.context = context
@@ -70,14 +69,14 @@ class Checkpoint(BaseCallback):
 
 def save_checkpoint(path: str | Path, model: BaseAlgorithm, context: Any = None, about: dict[str, Any] | None = None) -> None:
     """
-    Keep everything that the next number depends on.
+    Save everything that influences later numbers.
 
-    :param path: file to write; an old one stays whole until the new one is. Nobody else may write it
-    :param model: between two calls of ``collect_rollouts``, as in :class:`Checkpoint`
-    :param context: anything else to keep
+    :param path: file to write. An existing file is kept until the new one is complete. No other process may write it
+    :param model: the model, between two calls of ``collect_rollouts`` as in :class:`Checkpoint`
+    :param context: other objects to save
     :param about: plain values for :func:`read_about`
-    :raises ValueError: for environments in processes of their own, and for those that Gymnasium pickles as the arguments of
-        their constructor (``EzPickle``: its MuJoCo and Box2D tasks, Shimmy's): they would begin anew
+    :raises ValueError: for environments in other processes, and for environments that are pickled as the arguments of their
+        constructor (``EzPickle``: Gymnasium's MuJoCo and Box2D tasks, and Shimmy's), because they would start again
     """
     _check_environments(model)
     with atomic_path(path, alone=True) as temporary, temporary.open("wb") as file:
@@ -88,35 +87,34 @@ def save_checkpoint(path: str | Path, model: BaseAlgorithm, context: Any = None,
 
 
 def read_about(path: str | Path) -> dict[str, Any]:
-    """What was said about a checkpoint when it was written, its ``"num_timesteps"`` and the packages' ``"versions"``."""
+    """The plain values that were saved with a checkpoint, its ``"num_timesteps"`` and the packages' ``"versions"``."""
     with Path(path).open("rb") as file:
         return _read_header(file)
 
 
 def load_checkpoint(path: str | Path) -> tuple[Any, Any]:
     """
-    Bring back a model, and set the global random generators to where they stood.
+    Load a model, and restore the global random generators.
 
-    Only load files that you trust: unpickling runs code. Continue with ``learn(..., reset_num_timesteps=False)``. A logger
-    that was set by hand must be set again.
+    Only load files that you trust: unpickling runs code. Continue with ``learn(..., reset_num_timesteps=False)``. Set a custom
+    logger again, because loggers are not saved.
 
     Loading changes no file. Once training continues, the first finished episode removes the episodes after the checkpoint from
     the Monitor file.
 
-    :param path: what :func:`save_checkpoint` wrote
+    :param path: file that :func:`save_checkpoint` wrote
     :return: the model with its environments and its replay buffer, and the context
-    :raises ValueError: if it is no checkpoint, or was written with other versions of the packages or on a device that is
-        not here
+    :raises ValueError: if the file is not a checkpoint, or if it was written with other package versions or with more GPUs
     """
     with Path(path).open("rb") as file:
         about = _read_header(file)
         if differing := differences(about["versions"], _versions()):
             raise ValueError(f"{path}: a checkpoint needs the versions that it was written with: {differing}.")
         if about["gpus"] > th.cuda.device_count():
-            raise ValueError(f"{path}: written with {about['gpus']} GPUs, here are {th.cuda.device_count()}; go on there.")
+            raise ValueError(f"{path}: written with {about['gpus']} GPUs, here are {th.cuda.device_count()}; continue there.")
         model, context, (python, numpy, torch, cuda) = cloudpickle.load(file)
-    model._custom_logger = False  # so that learn() makes one
-    if isinstance(model.replay_buffer, HerReplayBuffer):  # does not pickle its environment
+    model._custom_logger = False  # so that learn() creates a logger
+    if isinstance(model.replay_buffer, HerReplayBuffer):  # it does not pickle its environment
         model.replay_buffer.set_env(model.env)
     random.setstate(python)
     np.random.set_state(numpy)  # noqa: NPY002 (SB3 samples with it)
@@ -151,7 +149,7 @@ def _check_environments(model: BaseAlgorithm) -> None:
         if _begins_anew(layer):
             raise ValueError(
                 f"{type(layer).__name__} is pickled as the arguments of its constructor (EzPickle): after a checkpoint it "
-                "would begin anew in the middle of an episode. Train without checkpoints, or give it a __getstate__ that "
+                "would begin anew in the middle of an episode. Train without checkpoints, or define a __getstate__ that "
                 "keeps its state."
             )
 
@@ -163,7 +161,7 @@ def _begins_anew(env: gym.Env) -> bool:
 def _read_header(file: BinaryIO) -> dict[str, Any]:
     try:
         about = pickle.load(file)
-    except Exception as error:  # unpickling what is no pickle may raise anything
+    except Exception as error:  # unpickling an arbitrary file can raise anything
         raise ValueError(f"{file.name}: this is no checkpoint. Name another file.") from error
     if not isinstance(about, dict) or not about.keys() >= {"num_timesteps", "versions", "gpus"}:
         raise ValueError(f"{file.name}: this is no checkpoint, but some other pickle. Name another file.")
@@ -181,16 +179,16 @@ def _generator_states(device: th.device) -> tuple[Any, ...]:
 
 
 class _Pickler(cloudpickle.Pickler):
-    """Takes out what belongs to a process and is made anew when training goes on."""
+    """Leaves out objects that belong to a process and are created again when training continues."""
 
     def reducer_override(self, obj: Any) -> Any:
-        if isinstance(obj, Logger):  # open files; learn() makes another
+        if isinstance(obj, Logger):  # it has open files; learn() creates another
             return type(None), ()
         if isinstance(obj, ProgressBarCallback):  # a bar on the screen
             return ProgressBarCallback, ()
-        if isinstance(obj, BaseCallback):  # the local and global variables of learn()
+        if isinstance(obj, BaseCallback):  # except the local and global variables of learn()
             return _bare, (type(obj), {"locals": {}, "globals": {}}), _without(obj, "locals", "globals"), None, None, _fill
-        if isinstance(obj, VecEnvWrapper):  # the members of its class; VecNormalize would leave out its environment as well
+        if isinstance(obj, VecEnvWrapper):  # except the members of its class; VecNormalize would drop its environment
             return _bare_wrapper, (type(obj),), _without(obj, "class_attributes"), None, None, _fill
         if isinstance(obj, ResultsWriter):
             obj.file_handler.flush()
@@ -219,11 +217,11 @@ def _bare_wrapper(cls: type) -> Any:
 
 
 class _ContinuedResults(ResultsWriter):
-    """The file of a Monitor. Its first new episode replaces those that ended after the checkpoint: they will end again."""
+    """A Monitor's file. The first new episode removes the episodes that ended after the checkpoint; they will be repeated."""
 
     def __init__(self, name: str, size: int, extra_keys: tuple[str, ...]) -> None:
         super().__init__(name, extra_keys=extra_keys, override_existing=False)
-        self.size: int | None = size  # of the file at the checkpoint, until it is that again
+        self.size: int | None = size  # size of the file at the checkpoint; None once it has been restored
 
     def write_row(self, epinfo: dict[str, float]) -> None:
         if self.size is not None:

@@ -1,4 +1,4 @@
-"""Frames packed for a file: compressed where that pays, never copied where it does not."""
+"""Pack frames for a file: compressed if this saves much, otherwise without a copy."""
 
 import pickle
 import zlib
@@ -8,8 +8,8 @@ from functools import partial
 
 import numpy as np
 
-BLOCK_BYTES = 2**26  # frames are saved in blocks of this size: above 32 MiB malloc gives freed memory back to the system
-PROBE_FRAMES = 64  # frames of a block that are compressed to see whether the whole block is worth it
+BLOCK_BYTES = 2**26  # size of a block of frames: above 32 MiB malloc returns freed memory to the system
+PROBE_FRAMES = 64  # frames that are compressed first, to decide whether to compress the whole block
 
 Block = bytes | bytearray | pickle.PickleBuffer
 
@@ -17,7 +17,7 @@ Block = bytes | bytearray | pickle.PickleBuffer
 def pack(frames: np.ndarray, in_place: bool) -> list[Block]:
     """
     :param frames: (N, C, H, W), uint8
-    :param in_place: whether what does not compress may be handed to pickle without a copy, which takes protocol 5
+    :param in_place: pass blocks that do not compress to pickle without a copy; needs protocol 5
     :return: blocks of frames
     """
     n_block = max(BLOCK_BYTES // frames[0].nbytes, 1)
@@ -28,8 +28,8 @@ def pack(frames: np.ndarray, in_place: bool) -> list[Block]:
 
 def unpack(blocks: Iterable[bytes | bytearray], frames: np.ndarray) -> None:
     """
-    :param blocks: what :func:`pack` returned
-    :param frames: (M, C, H, W), uint8, M >= N: written from the first frame on
+    :param blocks: result of :func:`pack`
+    :param frames: (M, C, H, W), uint8, M >= N; its first N frames are overwritten
     """
     start = 0
     for block in blocks:
@@ -38,8 +38,8 @@ def unpack(blocks: Iterable[bytes | bytearray], frames: np.ndarray) -> None:
 
 def _pack_block(block: np.ndarray, in_place: bool) -> Block:
     """
-    Compress frames to ``bytes`` where zlib at least halves them: rendered scenes become 8 times smaller, video only 1.3 times.
-    Return the others as they are, without a copy if ``in_place``.
+    Compress frames to ``bytes`` if zlib at least halves them: rendered scenes become 8 times smaller, video only 1.3 times.
+    Return other frames uncompressed, without a copy if ``in_place``.
     """
     probe = block[:PROBE_FRAMES]
     if 2 * len(zlib.compress(probe.data)) <= probe.nbytes:
@@ -48,10 +48,10 @@ def _pack_block(block: np.ndarray, in_place: bool) -> Block:
 
 
 def _unpack_block(block: bytes | bytearray, frames: np.ndarray) -> int:
-    """Write a block to ``frames`` and return its length. A ``PickleBuffer`` comes back as ``bytearray``."""
+    """Write a block to ``frames`` and return its length. A ``PickleBuffer`` is unpickled as a ``bytearray``."""
     raw = zlib.decompress(block) if isinstance(block, bytes) else block
     n_frames = len(raw) // frames[0].nbytes
     frames[:n_frames] = np.frombuffer(raw, dtype=np.uint8).reshape(n_frames, *frames.shape[1:])
     if isinstance(block, bytearray):
-        block.clear()  # the unpickler holds on to every block until it has read the last: twice the memory otherwise
+        block.clear()  # the unpickler keeps all blocks until the end, which would need twice the memory
     return n_frames

@@ -40,7 +40,7 @@ class BisimSAC(SAC):
     :param metric_kwargs: other settings of the metric, such as ``dict(successors="sample", pairs="all")``; see
         :class:`sb3_robust_bisim.metrics.Metric`
     :param dynamics: "deterministic", "probabilistic" (Gaussian) or "ensemble" (5 Gaussians)
-    :param nll_beta: in [0, 1]; above 0 Gaussian dynamics learn by beta-NLL, see :func:`sb3_robust_bisim.losses.dynamics_loss`
+    :param nll_beta: in [0, 1], for Gaussian dynamics: 0 is the likelihood, above 0 beta-NLL; see ``losses.dynamics_loss``
     :param model_coef: weight of dynamics and reward loss, >= 0. None: 1 where a model is needed, that is with
         ``bisim_coef`` or ``intrinsic_reward_scale`` above 0, else 0
     :param reward_coef: weight of the reward loss where it differs from ``model_coef``, >= 0
@@ -84,7 +84,7 @@ class BisimSAC(SAC):
         distance: str = "huber",
         metric_kwargs: dict[str, Any] | None = None,
         dynamics: str = "deterministic",
-        nll_beta: float = 0.0,
+        nll_beta: float = 1.0,
         model_coef: float | None = None,
         reward_coef: float | None = None,
         intrinsic_reward_scale: float = 0.0,

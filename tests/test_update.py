@@ -70,7 +70,7 @@ def test_an_update_follows_the_equations(dynamics: str) -> None:
     if std is not None:
         sampled = mean + std * th.randn_like(mean)
         sampled = sampled * (model.radius / sampled.norm(dim=1, keepdim=True)).clamp(max=1)
-        error = error / std.square() + std.log()
+        error = std.detach() ** 2 * (error / std.square() + std.log())  # beta-NLL with beta = 1
     dynamics_loss, reward_loss = error.mean(), (old.representation.reward_model(sampled)[0] - rewards).square().mean()
     other = th.randperm(len(z))
     if std is not None:

@@ -1,6 +1,7 @@
 """Encoders phi: observation -> embedding z. Any features extractor may be one; :class:`Encoder` makes it so."""
 
 from contextlib import nullcontext
+from typing import Any
 
 import torch as th
 from gymnasium import spaces
@@ -40,6 +41,13 @@ class Encoder(BaseFeaturesExtractor):
         self.sphere = sphere
         self.bf16 = bf16
         self.normalize_images = normalize_images
+
+    def __getattr__(self, name: str) -> Any:
+        """Attributes of the extractor are found here too, as code written for SB3 expects."""
+        try:
+            return super().__getattr__(name)
+        except AttributeError:
+            return getattr(super().__getattr__("extractor"), name)
 
     def encode(self, obs: "PyTorchObs | Encoded") -> th.Tensor:
         """z = phi(s) in fp32 and inside the ball, (B, n). What has been encoded before is looked up."""

@@ -218,7 +218,7 @@ def test_batch_norm_and_dropout_act_only_in_training(share: bool) -> None:
     policy_kwargs = dict(net_arch=[16], features_extractor_class=NormDropout, share_features_extractor=share)
     model = with_data(policy_kwargs=policy_kwargs, tau=0.0, target_update_interval=2)
     nets = (model.critic, model.critic_target, model.actor)
-    norm, target_norm, actor_norm = (net.features_extractor.extractor.norm for net in nets)
+    norm, target_norm, actor_norm = (net.features_extractor.norm for net in nets)
     assert norm.running_mean.eq(0).all()  # acting and the bonus do not change the statistics
     obs = np.ones((4, 3), dtype=np.float32)
     np.testing.assert_array_equal(model.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])

@@ -37,7 +37,7 @@ class BisimSAC(SAC):
         c_R (R_max - R_min) / (2 (1 - c_T)). Between points of it only ``distance="l2"`` is at most the metric's diameter.
         "sphere": scale embeddings to length 1 (SimSR)
     :param distance: "huber" (elementwise, the paper's), "l1", "l2", "mico", "cosine" or "rap"; :mod:`sb3_robust_bisim.losses`
-    :param metric_kwargs: other settings of the metric, such as ``dict(successors="sample", pairs="all")``; see
+    :param metric_kwargs: other settings of the metric, such as ``dict(successors="sample", absorbing=True)``; see
         :class:`sb3_robust_bisim.metrics.Metric`
     :param dynamics: "deterministic", "probabilistic" (Gaussian) or "ensemble" (5 Gaussians)
     :param nll_beta: in [0, 1], for Gaussian dynamics: 0 is the likelihood, above 0 beta-NLL; see ``losses.dynamics_loss``

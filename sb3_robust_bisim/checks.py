@@ -25,9 +25,10 @@ def check_arguments(model: Any) -> None:
     _require(isinstance(model.bf16, (bool, np.bool_)), model, "bf16", "True or False")
     for name, least in (("policy_delay", 1), ("initial_gradient_steps", 0)):
         value = getattr(model, name)
-        _require(isinstance(value, (int, np.integer)) and value >= least, model, name, f"an integer >= {least}")
+        whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+        _require(whole and value >= least, model, name, f"an integer >= {least}")
 
-    if model.bf16 and model.device.type == "cpu" and not th.ops.mkldnn._is_mkldnn_bf16_supported():
+    if model.bf16 and model.device.type == "cpu" and not getattr(th.ops.mkldnn, "_is_mkldnn_bf16_supported", bool)():
         warnings.warn("bf16=True: this CPU has no bfloat16 instructions, so fp32 is several times faster.", stacklevel=4)
     _check_random_shift(model.random_shift, model.observation_space)
     n_steps = model.n_steps if model.n_steps != 1 else model.replay_buffer_kwargs.get("n_steps", 1)
@@ -36,6 +37,16 @@ def check_arguments(model: Any) -> None:
         raise ValueError(
             f"n_steps={n_steps} (replay_buffer_class={buffer_class}): dynamics, inverse dynamics and metric are about one "
             "step. Use n_steps=1 and no NStepReplayBuffer."
+        )
+    if model.optimize_memory_usage:
+        raise ValueError(
+            "optimize_memory_usage=True: at the end of an episode SB3 then takes the start of the next one for the successor, "
+            "and models and metric would learn it. Set it to False; FrameStackReplayBuffer saves memory for images."
+        )
+    absorbing = (model.metric_kwargs or {}).get("absorbing", False)
+    if absorbing and not model.replay_buffer_kwargs.get("handle_timeout_termination", True):
+        raise ValueError(
+            "absorbing=True with handle_timeout_termination=False: time-outs would become absorbing states. Remove one of both."
         )
     if model.intrinsic_reward_scale > 0 and buffer_class is not None and issubclass(buffer_class, HerReplayBuffer):
         raise ValueError(

@@ -41,6 +41,7 @@ class Encoder(BaseFeaturesExtractor):
         self.sphere = sphere
         self.bf16 = bf16
         self.normalize_images = normalize_images
+        self.of_bytes = normalize_images and is_image_space(observation_space)
 
     def __getattr__(self, name: str) -> Any:
         """Attributes of the extractor are found here too, as code written for SB3 expects."""
@@ -55,7 +56,7 @@ class Encoder(BaseFeaturesExtractor):
 
     def preprocess(self, obs: PyTorchObs) -> PyTorchObs:
         """Floats, images in [0, 1]; under bf16, images for our own extractor come at once as autocast would round them."""
-        if self.bf16 and self.normalize_images and type(self.extractor) is PixelEncoder:
+        if self.bf16 and self.of_bytes and type(self.extractor) is PixelEncoder:
             assert isinstance(obs, th.Tensor)
             return obs.to(th.bfloat16, copy=True).div_(255)  # 0..255 are exact in bf16
         return preprocess_obs(obs, self._observation_space, self.normalize_images)

@@ -96,6 +96,10 @@ class Metric:
                 self.distance == "huber" and self.pairs == "all",
                 "it keeps all coordinates of each pair; use pairs='permutation' or another distance",
             ),
+            f"distance={self.distance!r} with successors='model'": (
+                self.distance == "cosine" and self.successors == "model",
+                "predictions are no unit vectors; use successors='sample'",
+            ),
             f"target_encoder={self.target_encoder!r} with successors='model'": (
                 self.target_encoder != "none" and self.successors == "model",
                 "the model predicts from the online encoder; use successors='sample' or target_encoder='none'",
@@ -116,6 +120,7 @@ class Metric:
         rewards: th.Tensor,
         successors: tuple[th.Tensor, th.Tensor | None],
         variance: th.Tensor | None = None,
+        n_partners: int | None = None,
     ) -> tuple[Gaps, tuple[th.Tensor, th.Tensor]]:
         """
         Pair the rows of a batch, at random where ``pairs`` is "permutation".
@@ -125,13 +130,15 @@ class Metric:
         :param rewards: (B, 1)
         :param successors: mean and standard deviation of what follows, (B, n) each, or None for points
         :param variance: (B, 1) predicted variance of the rewards, or None
+        :param n_partners: the first rows, from which "permutation" draws partners; B is a multiple of it. None: all
         :return: the gaps, and the numbers of the rows i and j of each pair, in shapes that broadcast to that of the pairs
         """
         rows = th.arange(len(z), device=z.device)
         if self.pairs == "all":
             i, j = rows[:, None], rows[None]
         else:
-            i, j = rows, th.randperm(len(z), device=z.device)
+            n = n_partners or len(z)
+            i, j = rows, th.cat([th.randperm(n, device=z.device) for _ in range(len(z) // n)])
         mean, std = successors
         distance = pairwise_distance(self._first(z), other_z[j], self.distance)
         with th.no_grad():

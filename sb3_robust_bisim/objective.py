@@ -34,6 +34,8 @@ class Objective:
     metric_kwargs: dict[str, Any] | None
 
     def __post_init__(self) -> None:
+        is_dict = self.metric_kwargs is None or isinstance(self.metric_kwargs, dict)
+        self._require(is_dict, "metric_kwargs", "None or a dict")
         for name in ("bisim_coef", "c_r", "intrinsic_reward_scale", "intrinsic_reward_max", "inverse_dynamics_coef"):
             self._require(_is_number(getattr(self, name), 0), name, "a finite number >= 0")
         for name in ("model_coef", "reward_coef"):
@@ -54,16 +56,19 @@ class Objective:
         self._require(shape, "norm_constraint", 'True, False or "sphere"')
         point = self.in_ball and self.c_r == 0
         self._require(not point, "c_r", "above 0, or norm_constraint=False: the ball is a point")
-        self._require(self.distance in DISTANCES, "distance", f"one of {', '.join(DISTANCES)}")
+        self._require(self.distance in tuple(DISTANCES), "distance", f"one of {', '.join(DISTANCES)}")
         self._require(self.dynamics in DYNAMICS, "dynamics", f"one of {', '.join(DYNAMICS)}")
         self._require(_is_number(self.nll_beta, 0) and self.nll_beta <= 1, "nll_beta", "in [0, 1]")
         on_sphere = self.distance != "cosine" or self.norm_constraint == "sphere"
         self._require(on_sphere, "distance", 'another one, or norm_constraint="sphere": it is meant for unit vectors')
         known = [field.name for field in fields(Metric)][3:]
-        kwargs = self.metric_kwargs or {}
+        kwargs = dict(self.metric_kwargs or {})
         for name in kwargs.keys() - known:
             raise ValueError(f"metric_kwargs with {name}={kwargs[name]!r}: it may hold {', '.join(known)}.")
         self.metric = Metric(self.distance, self.c_r, self.c_t, **kwargs)
+        corrected = self.metric.loss != "variance_corrected" or self.bisim_coef == 0 or self.reward_weight > 0
+        remedy = "above 0 with loss='variance_corrected', which needs the reward model; set model_coef, too"
+        self._require(corrected, "reward_coef", remedy)
 
     def _require(self, condition: bool, name: str, remedy: str) -> None:
         if not condition:
@@ -81,18 +86,23 @@ class Objective:
 
     @property
     def needs_model(self) -> bool:
-        from_model = (self.metric_kwargs or {}).get("successors", "model") == "model"
+        """Whether the metric or the bonus needs the dynamics model."""
+        kwargs = self.metric_kwargs or {}
+        from_model = kwargs.get("successors", "model") == "model" or kwargs.get("loss") == "variance_corrected"
         return (self.bisim_coef > 0 and from_model) or self.intrinsic_reward_scale > 0
 
     @property
     def in_ball(self) -> bool:
         """Whether the ball holds the embeddings."""
-        return self.norm_constraint is True or self.norm_constraint is np.True_
+        return isinstance(self.norm_constraint, (bool, np.bool_)) and bool(self.norm_constraint)
 
     @property
     def radius(self) -> float | None:
-        """Radius of the ball that holds the embeddings (eq:constraint), None without one."""
-        return ball_radius(self.c_r, self.c_t, self.reward_range) if self.in_ball else None
+        """Radius of the ball that holds the embeddings (eq:constraint), None without one. Absorbing states pay 0."""
+        r_min, r_max = self.reward_range
+        if self.metric.absorbing:
+            r_min, r_max = min(r_min, 0.0), max(r_max, 0.0)
+        return ball_radius(self.c_r, self.c_t, (r_min, r_max)) if self.in_ball else None
 
     @property
     def ratio_target(self) -> float:

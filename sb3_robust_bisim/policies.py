@@ -87,7 +87,8 @@ class BisimPolicy(SACPolicy):
         features_dim, action_dim = self.critic.features_extractor.features_dim, get_action_dim(self.action_space)
         self.representation = Representation(features_dim, action_dim, self.objective)
         if self.ortho_init:
-            self.apply(partial(self.init_weights, gain=1.0))
+            # frozen weights have been learned before
+            self.apply(lambda m: self.init_weights(m, gain=1.0) if all(p.requires_grad for p in m.parameters(False)) else None)
         self.critic_target.load_state_dict(self.critic.state_dict())
         self.critic_target.set_training_mode(False)
 

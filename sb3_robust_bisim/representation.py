@@ -37,12 +37,13 @@ class Representation(nn.Module):
     """
     Dynamics, reward and inverse-dynamics model, and the losses with which they and the metric shape the encoder.
 
-    All models are built whatever the objective, so that every method starts from the same weights for the same seed and
-    loads the checkpoints of the others.
+    All models are built whatever the objective. So methods with the same kind of dynamics start from the same weights for the
+    same seed, and load the checkpoints of each other.
 
     :param features_dim: width n of the embedding
     :param action_dim: n_a
-    :param objective: its settings may be changed between two updates, to anneal a weight for example
+    :param objective: its weights may be changed between two updates (``bisim_coef``, ``model_coef``, ``reward_coef``,
+        ``inverse_dynamics_coef`` above 0, ``nll_beta``). They are not saved
     """
 
     def __init__(self, features_dim: int, action_dim: int, objective: Objective) -> None:
@@ -61,7 +62,7 @@ class Representation(nn.Module):
         objective = self.objective
         total, logged = batch.z.new_zeros(()), {}
         prediction = reward_variance = None
-        if objective.model_weight > 0 or objective.needs_model:
+        if max(objective.model_weight, objective.reward_weight) > 0 or objective.needs_model:
             prediction = self.dynamics(batch.z, batch.actions)
             logged["train/dynamics_loss"] = losses.dynamics_loss(
                 prediction.mean, prediction.std, batch.next_z, objective.nll_beta
@@ -108,7 +109,7 @@ class Representation(nn.Module):
             successors = th.cat([mean, end]), None if std is None else th.cat([std, th.zeros_like(std)])
             z, other_z, rewards = th.cat([z, ends]), th.cat([other_z, other_ends]), th.cat([rewards, th.zeros_like(rewards)])
             variance = None if variance is None else th.cat([variance, th.zeros_like(variance)])
-        gaps, (i, j) = metric.gaps(z, other_z, rewards, successors, variance)
+        gaps, (i, j) = metric.gaps(z, other_z, rewards, successors, variance, n_partners=len(batch.z))
         losses_of_pairs = METRIC_LOSSES[metric.loss](gaps, metric.c_r, metric.c_t)
 
         def mean_over_pairs(values: th.Tensor) -> th.Tensor:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
-from small_models import make_model
+from small_models import make_model, pendulum
 
 from sb3_robust_bisim import BisimSAC
 from sb3_robust_bisim.losses import DISTANCES, pairwise_distance
@@ -137,7 +137,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 def model_of(name: str, **kwargs: Any) -> Any:
     settings = dict(VARIANTS[name])
     settings["metric_kwargs"] = {k: v for k, v in settings["metric_kwargs"].items() if k != "distance"}
-    return make_model(env=ENV, **{"intrinsic_reward_scale": 0.0, "inverse_dynamics_coef": 0.0, **settings, **kwargs})
+    return make_model(**{"env": ENV, "intrinsic_reward_scale": 0.0, "inverse_dynamics_coef": 0.0, **settings, **kwargs})
 
 
 @pytest.mark.parametrize("name", VARIANTS)
@@ -181,8 +181,8 @@ def test_an_end_of_an_episode_is_an_absorbing_state_without_reward() -> None:
     th.manual_seed(0)
     _, logged = model.policy.representation.losses(batch)
     th.manual_seed(0)
-    pairs = [(i, int(j)) for i, j in enumerate(th.randperm(2 * B))]
-    # the terms of pairs with a successor that is no end must not count
+    # transitions and ends alike are paired with transitions; a successor that is no end must not count
+    pairs = [(i, int(j)) for i, j in enumerate(th.cat([th.randperm(B), th.randperm(B)]))]
     counts = [True] * B + ended.tolist()
     rows, following = th.cat([z, next_z]), th.cat([mean, next_z])
     paid = th.cat([rewards, th.zeros_like(rewards)])[:, 0]
@@ -195,9 +195,31 @@ def test_an_end_of_an_episode_is_an_absorbing_state_without_reward() -> None:
 
 
 def test_a_time_out_is_no_end() -> None:
-    model = model_of("absorbing").learn(210)  # an episode is truncated after 200 steps at the latest
-    data = model.replay_buffer.sample(500)
-    assert data.dones.sum() == 0 or data.dones.mean() < 1
+    model = model_of("absorbing", env=pendulum()).learn(40)  # four episodes, each of which ran out of time
+    assert model.replay_buffer.dones[:40].sum() == 4
+    _, batch = model.policy.encode(model.replay_buffer.sample(500))
+    assert batch.dones.sum() == 0
+
+
+def test_few_ends_leave_every_transition_a_partner() -> None:
+    model = model_of("absorbing")
+    z, next_z = normal(2, 2, 50).float()
+    batch = Batch(z, th.zeros(2, 1), th.zeros(2, 1), th.zeros(2, 1), next_z, next_z)
+    for _ in range(10):
+        assert model.policy.representation.losses(batch)[0].isfinite()
+
+
+def test_the_ball_has_room_for_an_end_without_reward() -> None:
+    radius = {
+        absorbing: model_of("absorbing", metric_kwargs=dict(absorbing=absorbing), reward_range=(9, 10), c_t=0.9).radius
+        for absorbing in (False, True)
+    }
+    assert radius == {False: pytest.approx(5.0), True: pytest.approx(50.0)}
+
+
+def test_a_reward_loss_alone_is_trained_too() -> None:
+    model = make_model(env=ENV, bisim_coef=0.0, intrinsic_reward_scale=0.0, reward_coef=1.0).learn(40)
+    assert model.logger.name_to_value["train/reward_loss"] > 0
 
 
 @pytest.mark.parametrize(
@@ -212,6 +234,19 @@ def test_a_time_out_is_no_end() -> None:
         (dict(metric_kwargs=dict(pairs="all")), "distance='huber' with pairs='all': .*another distance"),
         (dict(metric_kwargs=dict(target_encoder="both")), "target_encoder='both' with successors='model': .*sample"),
         (dict(metric_kwargs=dict(loss="variance_corrected")), "loss='variance_corrected' with distance='huber': .*rap"),
+        (dict(distance="cosine", norm_constraint="sphere"), "distance='cosine' with successors='model': .*sample"),
+        (dict(metric_kwargs="all"), "metric_kwargs='all': it must be None or a dict"),
+        (dict(distance=["l1"]), r"distance=\['l1'\]: it must be one of huber"),
+        (
+            dict(distance="rap", reward_coef=0.0, metric_kwargs=dict(loss="variance_corrected")),
+            r"reward_coef=0\.0: it must be above 0 with loss='variance_corrected'",
+        ),
+        (dict(optimize_memory_usage=True), "optimize_memory_usage=True: .*FrameStackReplayBuffer"),
+        (
+            dict(metric_kwargs=dict(absorbing=True), replay_buffer_kwargs=dict(handle_timeout_termination=False)),
+            "absorbing=True with handle_timeout_termination=False: ",
+        ),
+        (dict(policy_delay=True), "policy_delay=True: it must be an integer >= 1"),
         (dict(distance="cosine"), "distance='cosine': it must be another one, or norm_constraint=\"sphere\""),
         (dict(norm_constraint="cube"), "norm_constraint='cube': it must be True, False or \"sphere\""),
         (dict(nll_beta=2.0), r"nll_beta=2\.0: it must be in \[0, 1\]"),

@@ -36,7 +36,8 @@ def learning_rate_of(optimizer: th.optim.Optimizer | None) -> float:
 
 @pytest.mark.parametrize(("dynamics", "distance"), product(DYNAMICS, DISTANCES))
 def test_every_dynamics_model_trains_under_every_distance(dynamics: Any, distance: Any) -> None:
-    model = make_model(dynamics=dynamics, distance=distance, norm_constraint="sphere" if distance == "cosine" else True)
+    on_sphere = dict(norm_constraint="sphere", metric_kwargs=dict(successors="sample"))
+    model = make_model(dynamics=dynamics, distance=distance, **(on_sphere if distance == "cosine" else {}))
     before = parameters(model.policy)
     model.learn(EPISODE + 3)
     after = parameters(model.policy)

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -11,6 +12,7 @@ from torch.distributions import Distribution
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from sb3_robust_bisim.encoders import Encoder, PixelEncoder
 from sb3_robust_bisim.update_log import unchecked_distributions
 
 
@@ -91,3 +93,11 @@ def test_bf16_without_the_instructions_is_warned_of(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(th.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: False)
     with pytest.warns(UserWarning, match="bf16=True: this CPU has no bfloat16 instructions"):
         make_model(bf16=True, device="cpu")
+
+
+def test_bf16_takes_float_images_as_they_are() -> None:
+    space = gym.spaces.Box(0, 1, (3, 36, 36), np.float32)
+    extractor = PixelEncoder(space, normalized_image=True)
+    encoders = [Encoder(extractor, space, None, False, bf16, normalize_images=True) for bf16 in (False, True)]
+    obs = th.rand(2, 3, 36, 36)
+    assert th.equal(encoders[0].preprocess(obs), encoders[1].preprocess(obs))

@@ -46,7 +46,7 @@ def check_arguments(model: Any) -> None:
     absorbing = (model.metric_kwargs or {}).get("absorbing", False)
     if absorbing and not model.replay_buffer_kwargs.get("handle_timeout_termination", True):
         raise ValueError(
-            "absorbing=True with handle_timeout_termination=False: time-outs would become absorbing states. Remove one of both."
+            "absorbing=True with handle_timeout_termination=False: time-outs would become absorbing states. Drop one of both."
         )
     if model.intrinsic_reward_scale > 0 and buffer_class is not None and issubclass(buffer_class, HerReplayBuffer):
         raise ValueError(

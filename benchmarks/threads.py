@@ -22,17 +22,21 @@ SETTINGS: dict[str, dict[str, str]] = {
 
 def step_ms(kind: str, steps: int) -> float:
     """Milliseconds of a step of `learn()`, its update included."""
+    # update_cost.py, which has the same models, sets the number of threads when it is imported
     import gymnasium as gym
-    from update_cost import BATCH, CARTPOLE, FULL, SCHEDULE, RandomPixels
+    from stable_baselines3.common.envs import FakeImageEnv
 
     from sb3_robust_bisim import BisimSAC
 
-    settings: dict = dict(**FULL, **SCHEDULE["paper"], device="cpu", seed=0, batch_size=BATCH[kind], buffer_size=1000)
+    batch = 512 if kind == "mlp" else 128
+    settings: dict = dict(intrinsic_reward_scale=2.0, inverse_dynamics_coef=1.0, policy_delay=2, target_update_interval=2)
+    settings |= dict(device="cpu", seed=0, batch_size=batch, learning_starts=batch, buffer_size=1000)
     if kind == "mlp":
-        model = BisimSAC("MlpPolicy", gym.make(CARTPOLE, noise_multiplier=2), learning_starts=BATCH[kind], **settings)
+        model = BisimSAC("MlpPolicy", gym.make("robust_bisim/SparseCartPole-v0", noise_multiplier=2), **settings)
     else:
-        model = BisimSAC("CnnPolicy", RandomPixels(), learning_starts=BATCH[kind], **settings)
-    model.learn(BATCH[kind] + 2)
+        images = FakeImageEnv(screen_height=84, screen_width=84, n_channels=9, discrete=False, channel_first=True)
+        model = BisimSAC("CnnPolicy", images, **settings)
+    model.learn(batch + 2)
     started = time.perf_counter()
     model.learn(steps, reset_num_timesteps=False)
     return 1000 * (time.perf_counter() - started) / steps

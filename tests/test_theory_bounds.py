@@ -22,7 +22,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sb3_robust_bisim.losses import ball_radius, bisim_loss, project_to_ball
+from sb3_robust_bisim.losses import ball_radius, project_to_ball
+from sb3_robust_bisim.metrics import METRIC_LOSSES, Metric
 from sb3_robust_bisim.theory import (
     Array,
     FiniteMDP,
@@ -108,10 +109,10 @@ def test_ball_leaves_the_metric_loss_two_fixed_points_when_predictions_grow(shru
     c_t, k = 0.8, 1.5
     radius = ball_radius(1.0, c_t, (0.0, 1.0))
     z = shrunk * radius * th.tensor([[1.0, 0.0], [-1.0, 0.0]])
-    no_rewards, others = th.zeros(2, 1), th.tensor([1, 0])
-    loss, mean_distance, _ = bisim_loss(z, no_rewards, project_to_ball(k * z, radius), None, others, 1.0, c_t, "l2")
-    assert loss.item() == pytest.approx(0.0, abs=1e-9)
-    assert mean_distance.item() == pytest.approx(2 * shrunk * radius)
+    metric = Metric("l2", 1.0, c_t, pairs="all")
+    gaps, _ = metric.gaps(z, z, th.zeros(2, 1), (project_to_ball(k * z, radius), None))
+    assert METRIC_LOSSES[metric.loss](gaps, metric.c_r, metric.c_t).mean().item() == pytest.approx(0.0, abs=1e-9)
+    assert gaps.z[0, 1].item() == pytest.approx(2 * shrunk * radius)
 
 
 class TestValueDifference:

@@ -292,7 +292,7 @@ def plot(runs: list[dict], path: Path) -> None:
     for axes, arm in zip(figure.subplots(5, 5).flat, shown, strict=False):
         pairs = np.triu_indices(N_STATES, 1)
         largest = 0.0
-        for run in (run for run in runs if run["arm"] == asdict(arm)):
+        for run in (run for run in runs if Arm(**run["arm"]) == arm):
             exact, learned = np.array(run["exact"])[pairs], np.array(run["learned"])[pairs]
             largest = max(largest, exact.max())
             axes.plot(

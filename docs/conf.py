@@ -8,6 +8,7 @@ project = "sb3_robust_bisim"
 release = __version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode"]
 myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 3  # links to headings work as on GitHub
 exclude_patterns = ["_build"]
 html_theme = "furo"
 autodoc_member_order = "bysource"

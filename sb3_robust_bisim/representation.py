@@ -94,8 +94,8 @@ class Representation(nn.Module):
         if metric.target_encoder == "both":
             assert batch.target_z is not None
             other_z = batch.target_z
+        following = batch.next_z.detach() if metric.target_encoder == "none" else batch.target_next_z
         if metric.successors == "sample":
-            following = batch.next_z.detach() if metric.target_encoder == "none" else batch.target_next_z
             successors: tuple[th.Tensor, th.Tensor | None] = (following, None)
         else:
             assert prediction is not None
@@ -105,8 +105,8 @@ class Representation(nn.Module):
             # every successor is a row of its own, which follows itself without reward; only terminal ones count
             weights = th.cat([th.ones_like(batch.dones), batch.dones])
             ends, other_ends = batch.next_z, batch.next_z if other_z is z else batch.target_next_z
-            (mean, std), end = successors, ends.detach() if metric.target_encoder == "none" else batch.target_next_z
-            successors = th.cat([mean, end]), None if std is None else th.cat([std, th.zeros_like(std)])
+            mean, std = successors
+            successors = th.cat([mean, following]), None if std is None else th.cat([std, th.zeros_like(std)])
             z, other_z, rewards = th.cat([z, ends]), th.cat([other_z, other_ends]), th.cat([rewards, th.zeros_like(rewards)])
             variance = None if variance is None else th.cat([variance, th.zeros_like(variance)])
         gaps, (i, j) = metric.gaps(z, other_z, rewards, successors, variance, n_partners=len(batch.z))

@@ -1,5 +1,7 @@
 """Encoders phi: observation -> embedding z. Any features extractor may be one; :class:`Encoder` makes it so."""
 
+import math
+from collections.abc import Sequence
 from contextlib import nullcontext
 from typing import Any
 
@@ -55,10 +57,11 @@ class Encoder(BaseFeaturesExtractor):
         return obs[self] if isinstance(obs, Encoded) else self(self.preprocess(obs))
 
     def preprocess(self, obs: PyTorchObs) -> PyTorchObs:
-        """Floats, images in [0, 1]; under bf16, images for our own extractor come at once as autocast would round them."""
-        if self.bf16 and self.of_bytes and type(self.extractor) is PixelEncoder:
+        """Floats, images in [0, 1]. Images for our own extractor come in its memory format, and under bf16 at once rounded."""
+        if self.of_bytes and type(self.extractor) is PixelEncoder:
             assert isinstance(obs, th.Tensor)
-            return obs.to(th.bfloat16, copy=True).div_(255)  # 0..255 are exact in bf16
+            dtype = th.bfloat16 if self.bf16 else th.float32  # 0..255 are exact in both
+            return obs.contiguous(memory_format=th.channels_last).to(dtype, copy=True).div_(255)
         return preprocess_obs(obs, self._observation_space, self.normalize_images)
 
     def forward(self, preprocessed: PyTorchObs) -> th.Tensor:
@@ -112,34 +115,44 @@ class MlpEncoder(BaseFeaturesExtractor):
 
 class PixelEncoder(BaseFeaturesExtractor):
     """
-    The paper's pixel encoder: conv 3x3 stride 2 (32), conv 3x3 stride 1 (32), ReLU, linear to n, LayerNorm.
+    Encoder for images: convolutions of 32 filters 3x3 with ReLU, linear to n, LayerNorm. The paper's has strides 2 and 1.
 
     :param observation_space: channel-first image stack, (C, H, W)
     :param features_dim: width n of the embedding
+    :param strides: one convolution for each. Larger strides first make it cheaper: (3, 2, 1) costs a third of (2, 1)
     :param normalized_image: whether the space holds floats in [0, 1] already, see SB3's NatureCNN
-    :raises ValueError: for a space that does not hold images
+    :raises ValueError: for a space that does not hold images, or whose images are too small for ``strides``
     """
 
-    def __init__(self, observation_space: spaces.Box, features_dim: int = 50, normalized_image: bool = False) -> None:
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        features_dim: int = 50,
+        strides: Sequence[int] = (2, 1),
+        normalized_image: bool = False,
+    ) -> None:
         if not is_image_space(observation_space, check_channels=False, normalized_image=normalized_image):
             raise ValueError(
                 f"CnnPolicy needs images, the observation space is {observation_space}: use MlpPolicy, or MultiInputPolicy "
                 "for a Dict. For images that are floats already, pass policy_kwargs=dict(normalize_images=False)."
             )
         super().__init__(observation_space, features_dim)
-        self.convs = nn.Sequential(
-            nn.Conv2d(observation_space.shape[0], 32, kernel_size=3, stride=2),
-            nn.ReLU(),
-            nn.Conv2d(32, 32, kernel_size=3, stride=1),
-            nn.ReLU(),
-            nn.Flatten(),
-        )
-        with th.no_grad():
-            n_flat = self.convs(th.zeros(1, *observation_space.shape)).shape[1]
-        self.head = nn.Sequential(nn.Linear(n_flat, features_dim), nn.LayerNorm(features_dim))
+        channels, *size = observation_space.shape
+        convs: list[nn.Module] = []
+        for stride in strides:
+            if stride < 1 or min(size) < 3:
+                raise ValueError(
+                    f"strides={tuple(strides)} with images of shape {observation_space.shape}: strides must be at least 1, "
+                    "and each convolution needs 3 pixels. Take fewer or smaller strides, or larger images."
+                )
+            convs += [nn.Conv2d(channels, 32, kernel_size=3, stride=stride), nn.ReLU()]
+            channels, size = 32, [(pixels - 3) // stride + 1 for pixels in size]
+        self.convs = nn.Sequential(*convs, nn.Flatten())
+        self.head = nn.Sequential(nn.Linear(channels * math.prod(size), features_dim), nn.LayerNorm(features_dim))
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        return self.head(self.convs(observations))
+        # With the channels side by side in memory, convolutions are up to twice as fast on CPUs, and on GPUs under autocast
+        return self.head(self.convs(observations.to(memory_format=th.channels_last)))
 
 
 class CombinedEncoder(BaseFeaturesExtractor):

@@ -1,5 +1,6 @@
 """Updates are fast without a change of results: nothing waits for the device, and bf16 stays in the encoder."""
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from small_models import images, make_model, with_data
+from stable_baselines3.common.envs import FakeImageEnv
 from torch.distributions import Distribution
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -101,3 +103,19 @@ def test_bf16_takes_float_images_as_they_are() -> None:
     encoders = [Encoder(extractor, space, None, False, bf16, normalize_images=True) for bf16 in (False, True)]
     obs = th.rand(2, 3, 36, 36)
     assert th.equal(encoders[0].preprocess(obs), encoders[1].preprocess(obs))
+
+
+@pytest.mark.parametrize(("strides", "convolutions"), [((2, 1), [(2, 2), (1, 1)]), ([3, 2, 1], [(3, 3), (2, 2), (1, 1)])])
+def test_the_pixel_encoder_has_one_convolution_for_each_stride(strides: Any, convolutions: list[tuple[int, int]]) -> None:
+    model = make_model(
+        "CnnPolicy", FakeImageEnv(discrete=False), policy_kwargs=dict(features_extractor_kwargs=dict(strides=strides))
+    )
+    found = [m.stride for m in model.critic.features_extractor.modules() if isinstance(m, th.nn.Conv2d)]
+    assert found == convolutions
+    model.learn(12)
+
+
+@pytest.mark.parametrize("strides", [(0,), (2, -1), (2, 2, 2, 2), (12, 1)])
+def test_strides_that_leave_no_pixels_are_refused(strides: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=re.escape(f"strides={strides} with images of shape (1, 12, 12): strides must be")):
+        PixelEncoder(gym.spaces.Box(0, 255, (1, 12, 12), np.uint8), strides=strides)

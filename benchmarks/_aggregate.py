@@ -189,10 +189,14 @@ def tables(results: list[Result], figure: Figure, out: Path) -> dict[str, Any]:
     for panel in figure.panels:
         ends = {m: series(runs, "return")[1][:, -1] for m in figure.methods if (runs := of(results, panel=panel, method=m))}
         panels[panel] = {m: _ending(of(results, panel=panel, method=m), final, ends.get(FULL)) for m, final in ends.items()}
+        if figure.solved is not None:
+            for method, row in panels[panel].items():
+                row["solved"] = _solved(of(results, panel=panel, method=method), figure.solved)
     splits = list(dict.fromkeys(split for panel in figure.panels.values() for split in panel.splits))
     played = [f"final agent on {split} clips" for split in splits]
-    heads = ["task", "method", "runs", "last return of each", "mean ± s.e.", "IQM [95 %]", "P(full is better) [95 %]", *played]
-    heads += ["largest norm", "minutes"]
+    solved = [f"reached {figure.solved:g}", "median step", "mean fall after the best"] if figure.solved is not None else []
+    heads = ["task", "method", "runs", "last return of each", "mean ± s.e.", "IQM [95 %]", "P(full is better) [95 %]"]
+    heads += [*solved, *played, "largest norm", "minutes"]
     lines = [" | ".join(["", *heads, ""]).strip(), "|---" * len(heads) + "|"]
     for panel, methods in panels.items():
         for method, row in methods.items():
@@ -207,6 +211,7 @@ def tables(results: list[Result], figure: Figure, out: Path) -> dict[str, Any]:
                 f"{row['mean']}{error}",
                 "{} [{}, {}]".format(*row["iqm"]) if row["runs"] >= MANY else "",
                 better,
+                *row.get("solved", {}).values(),
                 *played,
             ]
             lines.append(" | ".join(["", *map(str, cells), str(row["largest_norm"]), str(row["minutes"]), ""]).strip())
@@ -245,6 +250,18 @@ def _ending(runs: list[Result], final: np.ndarray, full: np.ndarray | None) -> d
     for split in played[0] if played else ():
         row[f"final_return_{split}"] = [_short(np.mean(returns[split])) for returns in played]
     return row
+
+
+def _solved(runs: list[Result], threshold: float) -> dict[str, Any]:
+    """Which runs reach a return, the median of their first steps there, and how far runs end below their best evaluation."""
+    steps, returns = series(runs, "return")
+    first = [steps[np.argmax(row >= threshold)] for row in returns if row.max() >= threshold]
+    fall = (returns.max(axis=1) - returns[:, -1]).mean()
+    return {
+        "runs": f"{len(first)} of {len(runs)}",
+        "median_step": int(np.median(first)) if first else "",
+        "fall": _short(fall),
+    }
 
 
 def _short(value: float) -> float | None:

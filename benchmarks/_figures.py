@@ -51,6 +51,7 @@ class Figure:
     :param rows: what is drawn over the steps, keys of ``_aggregate.QUANTITIES``
     :param seconds_per_1000_steps: of one run on one core, until finished runs tell better
     :param eval_envs: side by side, worth it where episodes are long
+    :param solved: a return; the table says which runs reach it, when, and how far they fall after their best evaluation
     """
 
     panels: dict[str, Panel]
@@ -62,6 +63,7 @@ class Figure:
     seconds_per_1000_steps: float
     rows: tuple[str, ...] = ("mean_return", "embedding_norm_max")
     eval_envs: int = 1
+    solved: float | None = None
 
 
 def _variants(*names: str, **params: Any) -> dict[str, Method]:
@@ -113,6 +115,7 @@ FIGURES = {
         },
         *(10, 10_000, 500, 10, 17),
         rows=ALL_ROWS,
+        solved=195.0,
     ),
     "mountain_car": Figure(
         _noisy(MOUNTAIN_CAR, 1, 2),

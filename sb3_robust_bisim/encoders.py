@@ -120,6 +120,7 @@ class PixelEncoder(BaseFeaturesExtractor):
     :param observation_space: channel-first image stack, (C, H, W)
     :param features_dim: width n of the embedding
     :param strides: one convolution for each. Larger strides first make it cheaper: (3, 2, 1) costs a third of (2, 1)
+    :param layer_norm: normalise the embedding
     :param normalized_image: whether the space holds floats in [0, 1] already, see SB3's NatureCNN
     :raises ValueError: for a space that does not hold images, or whose images are too small for ``strides``
     """
@@ -129,6 +130,7 @@ class PixelEncoder(BaseFeaturesExtractor):
         observation_space: spaces.Box,
         features_dim: int = 50,
         strides: Sequence[int] = (2, 1),
+        layer_norm: bool = True,
         normalized_image: bool = False,
     ) -> None:
         if not is_image_space(observation_space, check_channels=False, normalized_image=normalized_image):
@@ -148,7 +150,8 @@ class PixelEncoder(BaseFeaturesExtractor):
             convs += [nn.Conv2d(channels, 32, kernel_size=3, stride=stride), nn.ReLU()]
             channels, size = 32, [(pixels - 3) // stride + 1 for pixels in size]
         self.convs = nn.Sequential(*convs, nn.Flatten())
-        self.head = nn.Sequential(nn.Linear(channels * math.prod(size), features_dim), nn.LayerNorm(features_dim))
+        norm = nn.LayerNorm(features_dim) if layer_norm else nn.Identity()
+        self.head = nn.Sequential(nn.Linear(channels * math.prod(size), features_dim), norm)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         # With the channels side by side in memory, convolutions are up to twice as fast on CPUs, and on GPUs under autocast

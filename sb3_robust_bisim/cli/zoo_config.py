@@ -43,21 +43,25 @@ def variant_settings(config: str | Path, env_id: str, *names: str) -> dict[str, 
     """
     Merge the settings of named variants, which override the entry of a task. Later names have priority.
 
+    Mappings such as ``env_kwargs`` are extended key by key, not replaced.
+
     :param config: YAML file with a mapping ``variants``; the entry of the task may have another one, with priority
     :param env_id: the task
     :param names: variants, for example ("DBC",) or ("SAC", "clean", "small")
+    :return: the keys that the variants set, to be laid over the entry
     :raises ValueError: if the file has no such variant
     """
     if not is_yaml(config):
         raise ValueError(f"-conf {config}: --variant needs a YAML file.")
     content = _read(config)
-    general, own = content.get("variants") or {}, content.get(env_id, {}).get("variants") or {}
+    entry = content.get(env_id, {})
+    general, own = content.get("variants") or {}, entry.get("variants") or {}
     settings: dict[str, Any] = {}
     for name in names:
         if name not in general and name not in own:
             raise ValueError(f"--variant {name}: for {env_id}, {config} has {', '.join({**general, **own}) or 'no variants'}.")
-        settings |= {**general.get(name, {}), **own.get(name, {})}
-    return settings
+        settings = _merged(_merged(settings, general.get(name, {})), own.get(name, {}))
+    return {key: value for key, value in _merged(entry, settings).items() if key in settings}
 
 
 def check_keys(hyperparams: dict[str, Any], source: str) -> None:
@@ -95,6 +99,16 @@ def check_task(env_id: str, config: str) -> None:
 def entry_of(config: str, env_id: str) -> dict[str, Any]:
     """The settings of a task in a YAML file; empty if it has no entry."""
     return _read(config).get(env_id, {})
+
+
+def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """``above`` laid over ``below``; mappings that both have are merged as well."""
+    both = {key: _merged(below[key], value) for key, value in above.items() if _are_mappings(value, below.get(key))}
+    return {**below, **above, **both}
+
+
+def _are_mappings(*values: Any) -> bool:
+    return all(isinstance(value, dict) for value in values)
 
 
 def _read(config: str | Path) -> dict[str, Any]:

@@ -2,8 +2,8 @@
 What is compared: tasks, methods, seeds and steps, after the figures of the paper. The settings are those of zoo_configs/.
 
 At a scale that a small machine finishes: the paper runs 10 seeds (5 from pixels), 50,000 steps of cartpole, 100,000 of
-pendulum and mountain car, 500,000 of each of 16 environments from pixels. `dmc_state`, `bf16`, `metric`, the methods
-`self-prediction` and `self-prediction-IR` and those with `half` in their names are not in the paper.
+pendulum and mountain car, 500,000 of each of 16 environments from pixels. `dmc_state`, `bf16`, `metric`, `metric_control`, the
+methods `self-prediction` and `self-prediction-IR` and those with `half` in their names are not in the paper.
 """
 
 from dataclasses import dataclass, field
@@ -13,6 +13,8 @@ CARTPOLE = "robust_bisim/SparseCartPole-v0"
 MOUNTAIN_CAR = "robust_bisim/MountainCarContinuous-v0"
 PENDULUM = "robust_bisim/SparsePendulum-v0"
 SWINGUP_PIXELS = "robust_bisim/cartpole-swingup-pixels-v0"
+# the literature's hard noise: all dimensions are mixed
+PROJECTED = {"action_repeat": 4, "noise_multiplier": 2, "random_projection": True}
 ALL_ROWS = ("mean_return", "iqm_return", "embedding_norm_max")  # an interquartile mean takes more than three seeds
 
 
@@ -79,9 +81,34 @@ _AS_WRITTEN = {
     f"{name}-max0.1": Method((name,), {"intrinsic_reward_max": 0.1}) for name in ("DBC-IR", "normed-IR", "normed-IR-ID")
 }
 _HALF = {"c_t": 0.5}
+
 _MICO = {"successors": "sample", "target_encoder": "both", "loss": "huber", "pairs": "all"}
 _SIMSR = {"successors": "sample", "target_encoder": "successors", "loss": "huber", "pairs": "all"}
 _RAP = {"loss": "variance_corrected"}
+
+
+def _with_and_without_metric(bonus: float) -> dict[str, Method]:
+    """
+    Everything the same but the metric.
+
+    :param bonus: intrinsic_reward_scale of the task, for the method that has none in the configuration
+    """
+    simsr = {"distance": "cosine", "norm_constraint": "sphere", "metric_kwargs": _SIMSR}
+    return {
+        "normed-IR-ID": Method(("normed-IR-ID",)),
+        "normed-IR-ID-no-metric": Method(("normed-IR-ID", "no-metric")),
+        "normed-IR": Method(("normed-IR",), seeds=5),
+        "normed-IR-no-metric": Method(("normed-IR", "no-metric"), seeds=5),
+        "IR": Method(("DBC-IR", "no-metric"), seeds=5),  # no ball either
+        "self-prediction-IR": Method(("self-prediction",), {"intrinsic_reward_scale": bonus}, seeds=5),
+        # another metric in the place of the full method's, with the same weight
+        "full-MICo": Method(("normed-IR-ID",), {"distance": "mico", "metric_kwargs": _MICO}, seeds=5),
+        "full-SimSR": Method(("normed-IR-ID",), simsr, seeds=5),
+        "full-RAP": Method(
+            ("normed-IR-ID",), {"distance": "rap", "dynamics": "probabilistic", "metric_kwargs": _RAP}, seeds=5
+        ),
+    }
+
 
 FIGURES = {
     "cartpole": Figure(
@@ -94,28 +121,16 @@ FIGURES = {
         *(5, 10_000, 500, 10, 17),
         rows=ALL_ROWS,
     ),
-    # everything the same but the metric
     "metric": Figure(
-        _noisy(CARTPOLE, 2, 3),
+        _noisy(CARTPOLE, 2, 3), _with_and_without_metric(2.0), *(10, 10_000, 500, 10, 17), ALL_ROWS, solved=195.0
+    ),
+    "metric_control": Figure(
         {
-            "normed-IR-ID": Method(("normed-IR-ID",)),
-            "normed-IR-ID-no-metric": Method(("normed-IR-ID", "no-metric")),
-            "normed-IR": Method(("normed-IR",), seeds=5),
-            "normed-IR-no-metric": Method(("normed-IR", "no-metric"), seeds=5),
-            "IR": Method(("DBC-IR", "no-metric"), seeds=5),  # no ball either
-            "self-prediction-IR": Method(("self-prediction",), {"intrinsic_reward_scale": 2.0}, seeds=5),
-            # another metric in the place of the full method's, with the same weight
-            "full-MICo": Method(("normed-IR-ID",), {"distance": "mico", "metric_kwargs": _MICO}, seeds=5),
-            "full-SimSR": Method(
-                ("normed-IR-ID",), {"distance": "cosine", "norm_constraint": "sphere", "metric_kwargs": _SIMSR}, seeds=5
-            ),
-            "full-RAP": Method(
-                ("normed-IR-ID",), {"distance": "rap", "dynamics": "probabilistic", "metric_kwargs": _RAP}, seeds=5
-            ),
+            "cheetah-run": Panel("robust_bisim/cheetah-run-v0", PROJECTED),
+            "cartpole-swingup_sparse": Panel("robust_bisim/cartpole-swingup_sparse-v0", PROJECTED),
         },
-        *(10, 10_000, 500, 10, 17),
-        rows=ALL_ROWS,
-        solved=195.0,
+        _with_and_without_metric(1.0),
+        *(3, 160_000, 8000, 5, 3),
     ),
     "mountain_car": Figure(
         _noisy(MOUNTAIN_CAR, 1, 2),
@@ -146,13 +161,22 @@ FIGURES = {
         _variants("SAC", "DBC", "normed-IR-ID"),
         *(3, 160_000, 8000, 5, 3),
     ),
+    # what random shifts, self-prediction, and the parts of the method contribute from pixels; all but SAC shift images
     "dmc_pixels": Figure(
         {
             "video": Panel(SWINGUP_PIXELS, variants=("small",), splits=("train", "eval")),
             "clean": Panel(SWINGUP_PIXELS, variants=("clean", "small")),
+            "ball_in_cup": Panel("robust_bisim/ball_in_cup-catch-pixels-v0", variants=("small",), splits=("train", "eval")),
         },
-        _variants("SAC", "normed-IR-ID"),
-        *(2, 65_000, 4000, 5, 25),
+        {
+            "normed-IR-ID": Method(("normed-IR-ID",)),
+            "SAC-shift": Method(("SAC",)),
+            "self-prediction-shift": Method(("self-prediction",), panels=("video", "ball_in_cup")),
+            "normed-IR-ID-no-metric": Method(("normed-IR-ID", "no-metric"), panels=("video",)),
+            "DBC-shift": Method(("DBC",), panels=("video",)),
+            "SAC": Method(("SAC",), {"random_shift": 0}, panels=("video",)),
+        },
+        *(2, 100_000, 5000, 5, 40),
     ),
     "bf16": Figure(
         _noisy(CARTPOLE, 2),

@@ -1,0 +1,100 @@
+"""
+One table of all methods on all tasks, from the results of `reproduce.py`: mean last return, standard error and runs.
+
+    python benchmarks/overview.py       # writes docs/overview.md, which the page "Which method should I use?" includes
+
+A result in bold is the best of its task, or within one standard error of the best.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+from _figures import FIGURES
+
+from sb3_robust_bisim.runs.atomic import atomic_path
+
+RESULTS = Path(__file__).parent / "results"
+# Heading, environment and arguments that tell the tasks apart, and the largest return where it is not 1000
+TASKS: dict[str, tuple[str, str]] = {
+    "cartpole, N_m = 0": ("robust_bisim/SparseCartPole-v0", "N_m=0"),
+    "N_m = 2": ("robust_bisim/SparseCartPole-v0", "N_m=2"),
+    "N_m = 3": ("robust_bisim/SparseCartPole-v0", "N_m=3"),
+    "mountain car, N_m = 2": ("robust_bisim/MountainCarContinuous-v0", "N_m=2"),
+    "swingup_sparse, state": ("robust_bisim/cartpole-swingup_sparse-v0", "cartpole-swingup_sparse"),
+    "cheetah-run, state": ("robust_bisim/cheetah-run-v0", "cheetah-run"),
+    "swingup, video": ("robust_bisim/cartpole-swingup-pixels-v0", "video"),
+}
+FIGURES_OF_METHODS = ("cartpole", "metric", "mountain_car", "dmc_state", "dmc_pixels")
+METHODS = {  # in the figures: in the table
+    "SAC": "SAC",
+    "SAC-shift": "SAC with random shift",
+    "DBC": "DBC",
+    "DBC-shift": "DBC with random shift",
+    "DBC-normed": "DBC-normed",
+    "DBC-IR": "DBC-IR",
+    "normed-ID": "normed-ID",
+    "normed-IR": "normed-IR",
+    "normed-IR-ID": "normed-IR-ID (full)",
+    "normed-IR-no-metric": "normed-IR without metric",
+    "normed-IR-ID-no-metric": "full without metric",
+    "self-prediction": "self-prediction",
+    "self-prediction-shift": "self-prediction with random shift",
+    "self-prediction-IR": "self-prediction with bonus",
+    "full-MICo": "full with MICo's metric",
+    "full-SimSR": "full with SimSR's metric",
+    "full-RAP": "full with RAP's metric",
+}
+
+
+def last_returns(env_id: str, panel: str) -> dict[str, list[float]]:
+    """The last return of each run of a task by method."""
+    found: dict[str, dict[int, float]] = {}
+    for figure in FIGURES_OF_METHODS:
+        if figure not in FIGURES:
+            raise KeyError(figure)
+        for path in sorted((RESULTS / figure).glob("*_seed*.json")):
+            run = json.loads(path.read_text())
+            if (run["env"], run["panel"], run["steps"]) == (env_id, panel, FIGURES[figure].steps):
+                found.setdefault(run["method"], {})[run["seed"]] = float(np.mean(run["evaluations"][-1]["returns"]))
+    return {method: list(seeds.values()) for method, seeds in found.items()}
+
+
+def error(values: list[float]) -> float:
+    return float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else 0.0
+
+
+def column(returns: dict[str, list[float]]) -> dict[str, str]:
+    """The cells of a task."""
+    best = max(returns, key=lambda method: np.mean(returns[method]), default="")
+    cells = {}
+    for method, values in returns.items():
+        text = f"{np.mean(values):.0f}" + (f" ± {error(values):.0f}" if len(values) > 1 else "")
+        near = np.mean(values) + error(values) >= np.mean(returns[best])
+        cells[method] = (f"**{text}**" if near else text) + f" ({len(values)})"
+    return cells
+
+
+def table() -> str:
+    columns = {name: column(last_returns(*task)) for name, task in TASKS.items()}
+    columns = {name: cells for name, cells in columns.items() if cells}
+    rows = [f"| method | {' | '.join(columns)} |", "|---" * (len(columns) + 1) + "|"]
+    for method, name in METHODS.items():
+        cells = [column.get(method, "") for column in columns.values()]
+        if any(cells):
+            rows.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(rows) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    default = Path(__file__).parents[1] / "docs" / "overview.md"
+    parser.add_argument("--out", type=Path, default=default, help="Markdown file (default: %(default)s)")
+    args = parser.parse_args()
+    with atomic_path(args.out) as temporary:
+        temporary.write_text(table())
+
+
+if __name__ == "__main__":
+    main()

@@ -44,7 +44,6 @@ def export_agent(model: BisimSAC, folder: str | Path) -> None:
     if normalize is not None and normalize.norm_obs:
         warnings.warn("VecNormalize is not exported: save it as well, or the agent cannot be used.", stacklevel=2)
     policy, encoder = model.policy, model.policy.critic.features_extractor
-    policy_kwargs = {k: v for k, v in model.policy_kwargs.items() if not k.startswith("features_extractor_")}
     settings = {name: getattr(model, name) for name in SETTINGS}
     frequency: Any = model.train_freq
     settings["train_freq"] = [frequency.frequency, frequency.unit.value]
@@ -53,6 +52,7 @@ def export_agent(model: BisimSAC, folder: str | Path) -> None:
         **agent_files.settings_to_json({"policy": model.policy_class}),
         "observation_space": agent_files.space_to_json(model.observation_space, "observation_space"),
         "action_space": agent_files.space_to_json(model.action_space, "action_space"),
+        # what PretrainedEncoder needs, the policy's defaults included
         "encoder": agent_files.settings_to_json(
             {
                 "features_extractor_class": type(encoder.extractor),
@@ -63,7 +63,8 @@ def export_agent(model: BisimSAC, folder: str | Path) -> None:
                 "normalize_images": encoder.normalize_images,
             }
         ),
-        "settings": agent_files.settings_to_json(settings) | {"policy_kwargs": agent_files.settings_to_json(policy_kwargs)},
+        "settings": agent_files.settings_to_json(settings)
+        | {"policy_kwargs": agent_files.settings_to_json(model.policy_kwargs)},
         "num_timesteps": model.num_timesteps,
         "n_updates": model._n_updates,
     }
@@ -128,9 +129,8 @@ def load_agent(
 def _settings(config: dict[str, Any], kwargs: dict[str, Any], file: Path) -> dict[str, Any]:
     """The arguments of BisimSAC: those of the file, replaced by the caller's."""
     exported = {**config["settings"], "policy": config["policy"]}
-    extractor = {name: value for name, value in config["encoder"].items() if name.startswith("features_extractor_")}
     policy_kwargs = agent_files.settings_from_json(
-        {**exported.pop("policy_kwargs"), **extractor},
+        exported.pop("policy_kwargs"),
         kwargs.get("policy_kwargs") or {},
         file,
         "load_agent(..., policy_kwargs=dict({}))",

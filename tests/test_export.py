@@ -124,7 +124,7 @@ def test_another_process_predicts_the_same(agents: Callable[[str], tuple[Any, Pa
 @pytest.mark.parametrize(
     "settings",
     [
-        dict(distance="cosine", norm_constraint="sphere", dynamics="ensemble", ent_coef=0.2, train_freq=(1, "episode")),
+        dict(distance="mico", norm_constraint="sphere", dynamics="ensemble", ent_coef=0.2, train_freq=(1, "episode")),
         dict(use_sde=True, c_t=0.5, reward_range=(-2.0, 3.0), metric_kwargs=dict(absorbing=True), target_entropy=-2.5),
         dict(
             policy_kwargs=dict(
@@ -299,18 +299,24 @@ HOSTILE: dict[str, tuple[Callable[[Path], Any], str]] = {
     "format": (lambda f: rewrite(f, "format", 2), "format=2, this version reads 1"),
     "part": (lambda f: rewrite(f, "observation_space", 1), "config.json: observation_space missing or of the wrong type"),
     "more": (lambda f: rewrite(f, "encoder.device", "cuda"), "config.json: unknown device"),
+    "space": (lambda f: rewrite(f, "observation_space", {"type": "os.system"}), "is not a Box, Discrete or Dict"),
+    "dtype of space": (lambda f: rewrite(f, "observation_space.dtype", "object"), "is not a Box, Discrete or Dict"),
+    "size of space": (lambda f: rewrite(f, "observation_space.shape", [10**6, 10**6]), "is not a Box.* at most 16777216"),
+}
+HOSTILE_TO_ENCODERS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "system": (lambda f: rewrite(f, "encoder.features_extractor_class", "os.system"), "'os.system' is not one of MlpEncoder"),
     "Popen": (
         lambda f: rewrite(f, "encoder.features_extractor_class", "subprocess.Popen"),
         "config.json: features_extractor_class='subprocess.Popen' .* no other class is imported. Pass",
     ),
     "kwargs": (lambda f: rewrite(f, "encoder.features_extractor_kwargs", {"x": 1}), "config.json: no .* unexpected keyword"),
-    "space": (lambda f: rewrite(f, "observation_space", {"type": "os.system"}), "is not a Box, Discrete or Dict"),
-    "dtype of space": (lambda f: rewrite(f, "observation_space.dtype", "object"), "is not a Box, Discrete or Dict"),
-    "size of space": (lambda f: rewrite(f, "observation_space.shape", [10**6, 10**6]), "is not a Box.* at most 16777216"),
 }
 HOSTILE_TO_AGENTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "policy": (lambda f: rewrite(f, "policy", "os.system"), "policy='os.system' is not one of MlpPolicy.*Pass load_agent"),
+    "system": (
+        lambda f: rewrite(f, "settings.policy_kwargs.features_extractor_class", "os.system"),
+        r"features_extractor_class='os.system' .* no other class is imported. Pass load_agent\(\.\.\., policy_kwargs=",
+    ),
     "optimizer": (
         lambda f: rewrite(f, "settings.policy_kwargs.optimizer_class", "subprocess.Popen"),
         r"optimizer_class='subprocess.Popen' is not one of Adam.*policy_kwargs=dict\(optimizer_class=",
@@ -323,18 +329,22 @@ HOSTILE_TO_AGENTS: dict[str, tuple[Callable[[Path], Any], str]] = {
 }
 
 
-@pytest.mark.parametrize("kind", [*HOSTILE, *HOSTILE_TO_AGENTS])
-def test_a_hostile_file_is_refused_and_runs_nothing(exported: Path, kind: str) -> None:
-    damage, message = {**HOSTILE, **HOSTILE_TO_AGENTS}[kind]
+def load_encoder(folder: Path) -> PretrainedEncoder:
+    bound = np.array([1, 1, 8], dtype=np.float32)  # of pendulum
+    return PretrainedEncoder(spaces.Box(-bound, bound), folder)
+
+
+@pytest.mark.parametrize(
+    ("load", "kind"),
+    [(load_agent, kind) for kind in HOSTILE | HOSTILE_TO_AGENTS]
+    + [(load_encoder, kind) for kind in HOSTILE | HOSTILE_TO_ENCODERS],
+)
+def test_a_hostile_file_is_refused_and_runs_nothing(exported: Path, load: Callable[[Path], Any], kind: str) -> None:
+    damage, message = {**HOSTILE, **(HOSTILE_TO_AGENTS if load is load_agent else HOSTILE_TO_ENCODERS)}[kind]
     damage(exported)
     with pytest.raises(ValueError, match=message) as refused:
-        load_agent(exported)
+        load(exported)
     assert str(exported) in str(refused.value)
-    if kind in HOSTILE:
-        space = spaces.Box(np.array([-1, -1, -8], dtype=np.float32), np.array([1, 1, 8], dtype=np.float32))
-        with pytest.raises(ValueError, match=message) as refused:
-            PretrainedEncoder(space, exported)
-        assert str(exported) in str(refused.value)
     assert not (exported / "marker").exists()
 
 

@@ -32,6 +32,9 @@ MAY_KNOW: dict[str, set[str]] = {
     "policies": {"augmentation", "encoders", "heads", "latent_models", "objective", "representation"},
     "checks": {"policies"},
     "bisim_sac": {"checks", "heads", "intrinsic_reward", "objective", "policies", "representation", "runs", "update_log"},
+    "agent_files": {"encoders", "frame_buffer", "policies", "runs"},
+    "export": {"agent_files", "bisim_sac", "checks"},
+    "pretrained_encoder": {"agent_files", "encoders"},
     "callbacks": {"bisim_sac", "encoders", "envs", "frame_buffer", "losses", "theory"},
     "cli": {"bisim_sac", "checks", "frame_buffer", "runs"},
 }

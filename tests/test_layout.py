@@ -33,7 +33,7 @@ MAY_KNOW: dict[str, set[str]] = {
     "checks": {"policies"},
     "bisim_sac": {"checks", "heads", "intrinsic_reward", "objective", "policies", "representation", "runs", "update_log"},
     "callbacks": {"bisim_sac", "encoders", "envs", "frame_buffer", "losses", "theory"},
-    "cli": {"bisim_sac", "checks", "frame_buffer", "runs"},
+    "cli": {"bisim_sac", "callbacks", "checks", "envs", "frame_buffer", "runs"},
 }
 
 

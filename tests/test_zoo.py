@@ -356,7 +356,7 @@ def test_the_package_runs_as_a_module_and_its_usage_names_the_commands(tmp_path:
     command = [sys.executable, "-m", "sb3_robust_bisim", "--help"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=True)
-    assert "usage: python -m sb3_robust_bisim {train,enjoy,plot_train,plot_from_file,all_plots}" in result.stderr
+    assert "usage: python -m sb3_robust_bisim {train,enjoy,evaluate,plot_train,plot_from_file,all_plots}" in result.stderr
 
 
 @pytest.mark.parametrize(

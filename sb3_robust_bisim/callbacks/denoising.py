@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_robust_bisim.callbacks.diagnostic import EnvironmentCallback, Step, embed
+from sb3_robust_bisim.bisim_sac import BisimSAC
+from sb3_robust_bisim.callbacks.diagnostic import EnvironmentCallback, Step, embed, undisturbed
 from sb3_robust_bisim.envs.noise import NoiseObservation
 from sb3_robust_bisim.frame_buffer import frames_per_observation
 
@@ -74,6 +75,22 @@ class DenoisingFactorCallback(EnvironmentCallback):
             self._held_out = DenoisingFactorCallback(
                 every, n_states, env_id, {**self.env_kwargs, **eval_env_kwargs}, seed, n_positives=n_positives
             )
+
+    def factor_of(self, model: BisimSAC) -> float:
+        """
+        Measure once, outside of a training. The model does not change.
+
+        :param model: agent with an environment (see SB3's ``set_env``), which determines the one to measure in
+        :return: denoising factor in [-1, 1]
+        :raises ValueError: as at the start of training
+        """
+        self.model = model
+        with undisturbed(model), th.no_grad():
+            try:
+                self._prepare()
+                return self._factor()
+            finally:
+                self._close()
 
     def _prepare(self) -> None:
         super()._prepare()

@@ -50,7 +50,7 @@ class DiagnosticCallback(BaseCallback):
             raise ValueError(f"{type(self).__name__} measures embeddings: it works with BisimSAC, not {type(self.model)}.")
         if self._last_look is None or self._last_look > self.num_timesteps:  # else a run continues, maybe from a checkpoint
             self._last_look = self.num_timesteps
-        with _undisturbed(self.model):
+        with undisturbed(self.model):
             self._prepare()
 
     def _on_step(self) -> bool:
@@ -69,7 +69,7 @@ class DiagnosticCallback(BaseCallback):
 
     def _look(self) -> None:
         self._last_look = self.num_timesteps
-        with _undisturbed(self.model), th.no_grad():
+        with undisturbed(self.model), th.no_grad():
             self._measure()
         # as in SB3's EvalCallback, so that the numbers are logged at the step to which they belong
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
@@ -131,6 +131,9 @@ class EnvironmentCallback(DiagnosticCallback):
 
     def _on_training_end(self) -> None:
         super()._on_training_end()
+        self._close()
+
+    def _close(self) -> None:
         if self._venv is not None:
             self._venv.close()
             self._venv = None
@@ -198,7 +201,7 @@ def embed(model: BisimSAC, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
 
 
 @contextmanager
-def _undisturbed(model: BisimSAC) -> Iterator[None]:
+def undisturbed(model: BisimSAC) -> Iterator[None]:
     """Restore the global random generators, which SB3 uses, and the policy's training mode afterwards."""
     numpy_state, training = np.random.get_state(), model.policy.training  # noqa: NPY002
     with th.random.fork_rng([model.device] if model.device.type == "cuda" else []):

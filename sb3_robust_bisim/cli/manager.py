@@ -2,7 +2,6 @@
 
 import inspect
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,6 +17,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_robust_bisim.bisim_sac import BisimSAC
+from sb3_robust_bisim.cli.record import record_or_explain
 from sb3_robust_bisim.cli.report import report
 from sb3_robust_bisim.cli.zoo_config import check_keys, check_task, entry_of, is_yaml, merged_policy_kwargs, variant_settings
 from sb3_robust_bisim.runs.checkpoint import Checkpoint, differences, load_checkpoint, read_about
@@ -215,19 +215,10 @@ class BisimExperimentManager(ExperimentManager):
             self.options.checkpoint.unlink(missing_ok=True)  # the run is complete
         report(Path(self.save_path), title, -1 if self.continue_training else getattr(model, "learning_starts", -1))
         if self.algo == ALGO and is_image_space(model.observation_space):
-            self._record(model)
+            print(f"Video:          {record_or_explain(model, self._rendered_eval_env, Path(self.save_path))}")
         print(f"Model:          {self.save_path}/{self.env_name}.zip")
         if tensorboard_log := getattr(model, "tensorboard_log", None):  # a continued run logs where it began
             print(f"TensorBoard:    tensorboard --logdir {tensorboard_log}")
-
-    def _record(self, model: BaseAlgorithm) -> None:
-        try:
-            from sb3_robust_bisim.cli.record import record
-        except ImportError as error:
-            print(f"Video:          not recorded, {error.name} is missing: pip install sb3_robust_bisim[dmc]")
-            return
-        with closing(self._rendered_eval_env()) as venv:
-            print("Video:         ", *record(model, venv, Path(self.save_path)))
 
     def _rendered_eval_env(self) -> VecEnv:
         """An evaluation environment that renders RGB frames."""

@@ -1,4 +1,4 @@
-"""The command line: rl-zoo3's commands, with BisimSAC as the default algorithm and a few more options for `train`."""
+"""The command line: `evaluate`, and rl-zoo3's commands with BisimSAC as the default algorithm and more options for `train`."""
 
 import argparse
 import os
@@ -12,11 +12,14 @@ from typing import Any
 
 import rl_zoo3.enjoy
 import rl_zoo3.train
+import torch as th
 from rl_zoo3 import ALGOS
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, convert_offpolicy_params
 from rl_zoo3.utils import EnvironmentName
 
 from sb3_robust_bisim.bisim_sac import BisimSAC
+from sb3_robust_bisim.cli.agents import latest_run
+from sb3_robust_bisim.cli.evaluate import DESCRIPTION, add_arguments, check_arguments, evaluate
 from sb3_robust_bisim.cli.manager import ALGO, BisimExperimentManager, RunOptions, sample_bisim_sac_params
 from sb3_robust_bisim.cli.zoo_config import DEFAULT_CONFIG, is_yaml
 
@@ -24,13 +27,14 @@ ALGOS[ALGO] = BisimSAC
 HYPERPARAMS_SAMPLER[ALGO] = sample_bisim_sac_params
 HYPERPARAMS_CONVERTER[ALGO] = convert_offpolicy_params
 
-COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots")
+COMMANDS = ("train", "enjoy", "evaluate", "plot_train", "plot_from_file", "all_plots")
+CHANGED = "rl-zoo3's command with these options changed or added:"
 SET_BY_THE_USER = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OMP_WAIT_POLICY")
 
 
 def main(arguments: Sequence[str] | None = None, program: str = "robust-bisim") -> None:
     """
-    Run one command of rl-zoo3.
+    Run one command.
 
     :param arguments: the command and its options; by default those of the process
     :param program: the name that usage and help show
@@ -48,6 +52,8 @@ def main(arguments: Sequence[str] | None = None, program: str = "robust-bisim") 
     elif command == "enjoy":
         with _replaced(sys, "argv", [program, *_enjoy_arguments(program, options)]):
             rl_zoo3.enjoy.enjoy()
+    elif command == "evaluate":
+        evaluate(_evaluate_arguments(program, options))
     else:
         try:
             from rl_zoo3 import plots
@@ -120,18 +126,25 @@ def _enjoy_arguments(program: str, arguments: list[str]) -> list[str]:
     parser.add_argument("--env", type=EnvironmentName, default=None, help="task")
     ours, theirs = _parse(parser, arguments)
     if ours.exp_id == 0 and ours.env is not None:
-        runs = Path(ours.folder, ours.algo).glob(f"{ours.env}_*/*.zip")
-        numbers = [suffix for run in runs if (suffix := run.parent.name.removeprefix(f"{ours.env}_")).isdigit()]
-        ours.exp_id = max(map(int, numbers), default=0)
+        ours.exp_id = latest_run(ours.folder, ours.algo, ours.env)
     env = [] if ours.env is None else ["--env", ours.env.gym_id]
     return [*theirs, "-f", ours.folder, "--exp-id", str(ours.exp_id), *env]
 
 
-def _parser(program: str) -> argparse.ArgumentParser:
-    """The options of `train` and `enjoy` that have a new meaning or a new default."""
-    parser = argparse.ArgumentParser(
-        prog=program, add_help=False, allow_abbrev=False, description="rl-zoo3's command with these options changed or added:"
-    )
+def _evaluate_arguments(program: str, arguments: list[str]) -> argparse.Namespace:
+    """Parse the arguments of `evaluate`, a command that rl-zoo3 does not have."""
+    parser = _parser(program, DESCRIPTION, add_help=True)
+    add_arguments(parser)
+    args = parser.parse_args(arguments)
+    check_arguments(parser, args)
+    if (n_threads := _n_threads(args)) > 0:
+        th.set_num_threads(n_threads)
+    return args
+
+
+def _parser(program: str, description: str = CHANGED, add_help: bool = False) -> argparse.ArgumentParser:
+    """The options that all commands have, with a new meaning or a new default for those of rl-zoo3."""
+    parser = argparse.ArgumentParser(prog=program, add_help=add_help, allow_abbrev=False, description=description)
     parser.add_argument("--algo", default=ALGO, help="RL algorithm (default: %(default)s)")
     parser.add_argument(
         "--num-threads",
@@ -149,9 +162,14 @@ def _parse(parser: argparse.ArgumentParser, arguments: list[str]) -> tuple[argpa
         parser.print_help()
         print("\nAll options of rl-zoo3:\n")
     ours, theirs = parser.parse_known_args(arguments)
-    if ours.num_threads is None:
-        ours.num_threads = -1 if any(name in os.environ for name in SET_BY_THE_USER) else 1
-    return ours, ["--algo", ours.algo, "--num-threads", str(ours.num_threads), *theirs]
+    return ours, ["--algo", ours.algo, "--num-threads", str(_n_threads(ours)), *theirs]
+
+
+def _n_threads(args: argparse.Namespace) -> int:
+    """The number of torch threads; -1: torch chooses."""
+    if args.num_threads is not None:
+        return args.num_threads
+    return -1 if any(name in os.environ for name in SET_BY_THE_USER) else 1
 
 
 def _check_writable(parser: argparse.ArgumentParser, checkpoint: Path) -> None:

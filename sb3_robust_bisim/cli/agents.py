@@ -1,0 +1,113 @@
+"""Find a trained agent in the folder of its run, and make its environment again."""
+
+import os
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rl_zoo3 import ALGOS, create_test_env, get_saved_hyperparams
+from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.utils import EnvironmentName, get_model_path
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+
+@dataclass(frozen=True)
+class Agent:
+    """
+    A saved agent, and the settings that it was trained with.
+
+    :param algo: name of the algorithm
+    :param env_id: id of its task
+    :param path: file with the agent
+    :param stats: folder with the settings and the statistics of VecNormalize; None: there are none
+    :param hyperparams: saved hyperparameters, which name the wrappers of the environment
+    :param env_kwargs: arguments of the environment
+    """
+
+    algo: str
+    env_id: str
+    path: Path
+    stats: str | None
+    hyperparams: dict[str, Any]
+    env_kwargs: dict[str, Any]
+
+    def make_env(self, env_kwargs: Mapping[str, Any], seed: int) -> VecEnv:
+        """
+        :param env_kwargs: arguments of the environment
+        :param seed: seed of its first reset
+        :return: one environment with the wrappers of the training
+        """
+        hyperparams = deepcopy(self.hyperparams)  # rl-zoo3 removes the wrappers from it
+        make = ExperimentManager.default_vec_env_cls
+        return create_test_env(self.env_id, 1, self.stats, seed, None, False, hyperparams, dict(env_kwargs), make)
+
+    def load(self, venv: VecEnv, device: str) -> BaseAlgorithm:
+        """
+        :param venv: an environment from :meth:`make_env`
+        :param device: device of the networks
+        :return: the agent, bound to the environment
+        :raises ValueError: if its spaces are not those of the environment
+        """
+        algorithm = ALGOS[self.algo]
+        # Evaluation needs no replay buffer and no schedules, which may not be loadable in this version of Python
+        small: dict[str, Any] = {"buffer_size": 1} if issubclass(algorithm, OffPolicyAlgorithm) else {}
+        unused = {"learning_rate": 0.0, "lr_schedule": lambda _: 0.0, "clip_range": lambda _: 0.0}
+        return algorithm.load(self.path, venv, device, custom_objects=unused, verbose=0, **small)
+
+
+def latest_run(folder: str, algo: str, env: EnvironmentName) -> int:
+    """
+    :param folder: folder with the runs
+    :param algo: name of the algorithm
+    :param env: task
+    :return: number of the latest run with a saved agent; 0 if there is none. rl-zoo3 takes the latest folder
+    """
+    runs = Path(folder, algo).glob(f"{env}_*/*.zip")
+    numbers = [suffix for run in runs if (suffix := run.parent.name.removeprefix(f"{env}_")).isdigit()]
+    return max(map(int, numbers), default=0)
+
+
+def find_agent(
+    folder: str,
+    algo: str,
+    env: EnvironmentName,
+    exp_id: int = 0,
+    load_best: bool = False,
+    load_checkpoint: str | None = None,
+    load_last_checkpoint: bool = False,
+) -> Agent:
+    """
+    Find an agent as rl-zoo3's ``enjoy`` does.
+
+    :param folder: folder with the runs
+    :param algo: name of the algorithm
+    :param env: task
+    :param exp_id: number of the run; 0: the latest one with an agent; -1: the agent is not in the folder of a run
+    :param load_best: the best agent of the run, not the last one
+    :param load_checkpoint: the agent after this number of steps
+    :param load_last_checkpoint: the last of these
+    :return: the agent
+    :raises ValueError: if there is no such agent
+    """
+    exp_id = exp_id or latest_run(folder, algo, env)
+    try:
+        if exp_id == 0:
+            raise ValueError(f"No run of {algo} on {env.gym_id} has an agent")
+        _, model, log_path = get_model_path(exp_id, folder, algo, env, load_best, load_checkpoint, load_last_checkpoint)
+    except (AssertionError, ValueError) as error:
+        raise ValueError(
+            f"--folder {folder}: {error}. Pass the --folder, --algo and --exp-id of a run that has one, or train it: "
+            f"robust-bisim train --env {env.gym_id}"
+        ) from error
+    stats = os.path.join(log_path, env)
+    hyperparams, found_stats = get_saved_hyperparams(stats, test_mode=True)
+    env_kwargs = hyperparams.pop("env_kwargs", {})
+    arguments = Path(stats, "args.yml")
+    if arguments.is_file():  # --env-kwargs of the training replaces those of the configuration
+        env_kwargs = yaml.unsafe_load(arguments.read_text())["env_kwargs"] or env_kwargs
+    return Agent(algo, env.gym_id, Path(model), found_stats, hyperparams, env_kwargs)

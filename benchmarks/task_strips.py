@@ -17,7 +17,9 @@ Policy = Callable[[np.ndarray], np.ndarray]
 SUITE_TASKS = ("cartpole-swingup", "cheetah-run", "walker-walk", "finger-spin", "reacher-easy")
 
 
-def frames(env_id: str, steps: tuple[int, ...], policy: Policy | None = None, seed: int = 1, **kwargs: Any) -> list[np.ndarray]:
+def frames(
+    env_id: str, steps: tuple[int, ...], policy: Policy | None = None, seed: int = 1, **kwargs: Any
+) -> list[np.ndarray]:
     """
     Frames of one episode.
 

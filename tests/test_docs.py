@@ -119,7 +119,9 @@ def check_script(words: list[str]) -> None:
         assert f'"{options[0]}": Figure(' in (ROOT / "benchmarks" / "_figures.py").read_text(), words
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "bash")], ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if blocks(page, "bash")], ids=lambda page: str(page.relative_to(ROOT))
+)
 def test_the_commands_of_a_page_exist_and_so_do_their_options(page: Path) -> None:
     targets = re.findall(r"^([a-z0-9-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
     for words in commands(page):

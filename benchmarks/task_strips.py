@@ -52,7 +52,10 @@ def suite(suffix: str, **kwargs: Any) -> list[np.ndarray]:
 
 
 STRIPS: dict[str, Callable[[], list[np.ndarray]]] = {
-    "sparse_cartpole": lambda: frames("SparseCartPole-v0", (0, 4, 8, 12, 16), lambda _: np.full(1, 0.15, dtype=np.float32)),
+    "sparse_cartpole": lambda: [
+        frame[130:350, 170:430]  # the track is wide and empty
+        for frame in frames("SparseCartPole-v0", (0, 4, 8, 12, 16), lambda _: np.full(1, 0.15, dtype=np.float32))
+    ],
     "sparse_pendulum": lambda: frames("SparsePendulum-v0", (0, 15, 30, 45, 60), along(2, 2.0), seed=34),
     "mountain_car": lambda: frames("MountainCarContinuous-v0", (0, 30, 60, 85, 105), along(1, 1.0)),
     "dmc_state": lambda: suite(""),

@@ -11,6 +11,10 @@ myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3  # links to headings work as on GitHub
 exclude_patterns = ["_build"]
 html_theme = "furo"
+html_title = project
+html_show_copyright = False
+html_static_path = ["_static"]
+html_css_files = ["tables.css"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 

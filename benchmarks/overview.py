@@ -70,7 +70,7 @@ def column(returns: dict[str, list[float]]) -> dict[str, str]:
     best = max(returns, key=lambda method: np.mean(returns[method]), default="")
     cells = {}
     for method, values in returns.items():
-        text = f"{np.mean(values):.0f}" + (f" ± {error(values):.0f}" if len(values) > 1 else "")
+        text = f"{np.mean(values) + 0.0:.0f}" + (f" ± {error(values):.0f}" if len(values) > 1 else "")
         near = np.mean(values) + error(values) >= np.mean(returns[best])
         cells[method] = (f"**{text}**" if near else text) + f" ({len(values)})"
     return cells

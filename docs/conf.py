@@ -9,8 +9,12 @@ release = __version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode"]
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3  # links to headings work as on GitHub
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "overview.md"]  # the table is part of another page
 html_theme = "furo"
+html_title = project
+html_show_copyright = False
+html_static_path = ["_static"]
+html_css_files = ["tables.css"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 

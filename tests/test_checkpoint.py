@@ -315,16 +315,21 @@ def test_an_interval_of_no_steps_between_checkpoints_is_refused() -> None:
 
 
 @pytest.fixture
-def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def arguments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The arguments of a run that is cut off before it saves its agent. It leaves a checkpoint at step 50."""
     monkeypatch.setattr(zoo.BisimExperimentManager, "save_trained_model", lambda *_: None)
-    common = [
+    return [
         *("train", "--env", "robust_bisim/SparseCartPole-v0", "--eval-freq", "-1", "--verbose", "0", "--n-timesteps", "60"),
         *("--log-folder", str(tmp_path), "--checkpoint", str(tmp_path / "checkpoint.pkl"), "--checkpoint-freq", "50"),
         *("-params", "learning_starts:20", "batch_size:8"),
     ]
-    zoo.main([*common, "--seed", "3"])
-    return common
+
+
+@pytest.fixture
+def command(arguments: list[str]) -> list[str]:
+    """The same arguments, after a run with seed 3."""
+    zoo.main([*arguments, "--seed", "3"])
+    return arguments
 
 
 @pytest.mark.parametrize(
@@ -373,11 +378,10 @@ def test_the_command_line_continues_another_versions_checkpoint_in_new_episodes(
 
 
 def test_the_command_line_continues_environments_in_other_processes(
-    command: list[str], capsys: pytest.CaptureFixture, tmp_path: Path
+    arguments: list[str], capsys: pytest.CaptureFixture
 ) -> None:
-    (tmp_path / "checkpoint.pkl").unlink()
     for _ in range(2):
-        zoo.main([*command, "--seed", "3", "--vec-env", "subproc"])
+        zoo.main([*arguments, "--seed", "3", "--vec-env", "subproc"])
     assert "Going on from step 50" in capsys.readouterr().out
 
 

@@ -1,10 +1,14 @@
 """Training that resumes from a checkpoint ends exactly like training that was never interrupted."""
 
+import os
 import pickle
 import signal
 import subprocess
 import sys
+import threading
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,13 +21,15 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
 from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer, IntrinsicRewardVecEnv
 from sb3_robust_bisim.cli import zoo
 from sb3_robust_bisim.runs.atomic import atomic_path
 from sb3_robust_bisim.runs.checkpoint import Checkpoint, load_checkpoint, read_about, save_checkpoint
+from sb3_robust_bisim.runs.hashed_file import replaced
 
 STEPS = 120
 LEARNING: dict[str, Any] = dict(learning_starts=20, buffer_size=200)
@@ -56,6 +62,17 @@ def model_of(task: str) -> BisimSAC:
     return make_model("CnnPolicy", pixel_task(), replay_buffer_class=FrameStackReplayBuffer, **LEARNING)
 
 
+def hindsight_model() -> BisimSAC:
+    env = BitFlippingEnv(n_bits=4, continuous=True)
+    settings = dict(intrinsic_reward_scale=0.0, replay_buffer_class=HerReplayBuffer)
+    return make_model("MultiInputPolicy", env, **LEARNING, **settings)
+
+
+def assert_equal_weights(model: BisimSAC, expected: BisimSAC) -> None:
+    for name, tensor in expected.policy.state_dict().items():
+        assert th.equal(tensor, model.policy.state_dict()[name]), name
+
+
 @pytest.mark.parametrize("task", ["state", "pixels"])
 def test_resumed_training_equals_uninterrupted_training(task: str, tmp_path: Path) -> None:
     expected = model_of(task).learn(STEPS)
@@ -68,8 +85,7 @@ def test_resumed_training_equals_uninterrupted_training(task: str, tmp_path: Pat
     model.learn(STEPS - model.num_timesteps, reset_num_timesteps=False)
 
     assert model.num_timesteps == expected.num_timesteps
-    for name, tensor in expected.policy.state_dict().items():
-        assert th.equal(tensor, model.policy.state_dict()[name]), name
+    assert_equal_weights(model, expected)
     np.testing.assert_array_equal(model.replay_buffer.rewards, expected.replay_buffer.rewards)
     np.testing.assert_array_equal(model.env.reset(), expected.env.reset())
 
@@ -97,42 +113,176 @@ def test_a_monitor_file_lists_each_episode_once(tmp_path: Path) -> None:
     assert episodes(tmp_path / "b") == episodes(tmp_path / "a")
 
 
-@pytest.mark.parametrize(
-    ("env", "venv_class", "message"),
-    [
-        ("Pendulum-v1", SubprocVecEnv, "use DummyVecEnv"),
-        (
-            "InvertedPendulum-v5",
-            DummyVecEnv,
-            r"InvertedPendulumEnv is pickled as the arguments of its constructor .* begin anew",
-        ),
-    ],
-)
-def test_environments_that_cannot_be_saved_are_refused_at_the_start(
-    env: str, venv_class: type[VecEnv], message: str, tmp_path: Path
-) -> None:
-    venv = make_vec_env(env, 1, vec_env_cls=venv_class)
+def test_environments_that_cannot_be_saved_are_refused_at_the_start(tmp_path: Path) -> None:
+    venv = make_vec_env("Pendulum-v1", 1)
+    venv.envs[0].unwrapped.lock = threading.Lock()  # type: ignore[attr-defined]
     model = make_model(env=venv, **LEARNING)
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match="PendulumEnv cannot be saved"):
         model.learn(30, callback=Checkpoint(tmp_path / "checkpoint.pkl", 100))
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match="PendulumEnv cannot be saved"):
         save_checkpoint(tmp_path / "checkpoint.pkl", model)
     assert not list(tmp_path.iterdir())
-    venv.close()
+
+
+def noise(kind: type[ActionNoise]) -> dict[str, Any]:
+    return dict(action_noise=kind(np.zeros(1), 0.3 * np.ones(1)))
+
+
+@pytest.mark.parametrize(
+    ("n_envs", "exploration"),
+    [
+        (1, dict(use_sde=True)),
+        (2, dict(use_sde=True, sde_sample_freq=3, train_freq=4)),
+        (1, noise(NormalActionNoise)),
+        (2, noise(OrnsteinUhlenbeckActionNoise)),
+    ],
+)
+def test_exploration_continues_exactly(n_envs: int, exploration: dict[str, Any], tmp_path: Path) -> None:
+    def model() -> BisimSAC:
+        return make_model(env=make_vec_env("Pendulum-v1", n_envs, seed=3), **LEARNING, **exploration)
+
+    path = tmp_path / "checkpoint.pkl"
+    expected = model().learn(60)
+    model().learn(60, callback=CallbackList([Checkpoint(path, 30), StopAt(48)]))
+    loaded, _ = load_checkpoint(path)
+    save_checkpoint(path, loaded, rollout_begun=True)  # before it has continued
+    continued, _ = load_checkpoint(path)
+    continued.learn(60 - continued.num_timesteps, reset_num_timesteps=False)
+    assert_equal_weights(continued, expected)
+    np.testing.assert_array_equal(continued.replay_buffer.actions, expected.replay_buffer.actions)
+
+
+TRAINING = """
+import os, signal, sys
+from pathlib import Path
+from small_models import make_model
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+from sb3_robust_bisim import IntrinsicRewardVecEnv
+from sb3_robust_bisim.runs import Checkpoint, ResumableSubprocVecEnv, load_checkpoint
+
+class KilledAt(BaseCallback):
+    def _on_step(self):
+        if self.num_timesteps == int(sys.argv[2]):
+            os.kill(os.getpid(), signal.SIGKILL)
+        return True
+
+def main():
+    path = Path(sys.argv[1], "checkpoint.pkl")
+    if path.exists():
+        model, _ = load_checkpoint(path)
+    else:
+        venv = make_vec_env("Hopper-v5", 2, seed=3, vec_env_cls=ResumableSubprocVecEnv, monitor_dir=sys.argv[1])
+        model = make_model(env=VecNormalize(IntrinsicRewardVecEnv(venv), norm_reward=False), use_sde=True, learning_starts=20)
+    model.learn(160 - model.num_timesteps, [Checkpoint(path, 60), KilledAt()], reset_num_timesteps=False)
+    model.save(Path(sys.argv[1], "agent.zip"))
+    model.env.close()
+
+if __name__ == "__main__":
+    main()
+"""
+
+
+def test_a_killed_process_continues_exactly(tmp_path: Path) -> None:
+    (tmp_path / "training.py").write_text(TRAINING)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+
+    def train(name: str, killed_at: int) -> int:
+        (tmp_path / name).mkdir(exist_ok=True)
+        command = [sys.executable, "training.py", name, str(killed_at)]
+        return subprocess.run(command, cwd=tmp_path, env=environment, timeout=300).returncode
+
+    assert train("alone", -1) == 0
+    assert train("killed", 150) == -signal.SIGKILL
+    assert read_about(tmp_path / "killed" / "checkpoint.pkl")["num_timesteps"] == 120
+    assert train("killed", -1) == 0
+    assert_equal_weights(*(BisimSAC.load(tmp_path / name / "agent.zip") for name in ("killed", "alone")))
+    for file in ("0.monitor.csv", "1.monitor.csv"):
+        killed, alone = ([line.split(",")[:2] for line in (tmp_path / name / file).open()][1:] for name in ("killed", "alone"))
+        assert killed == alone
+        assert len(alone) > 2
+
+
+@pytest.fixture
+def two(tmp_path: Path) -> Path:
+    """A checkpoint at step 40, with the one of step 20 before it."""
+    make_model(**LEARNING).learn(50, callback=Checkpoint(tmp_path / "checkpoint.pkl", 20))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint.pkl", "checkpoint.previous.pkl"]
+    return tmp_path / "checkpoint.pkl"
+
+
+def torn(content: bytes) -> bytes:
+    return content[: len(content) // 2]
+
+
+def altered(content: bytes) -> bytes:
+    return content[:-1000] + b"x" + content[-999:]
+
+
+def zeros(content: bytes) -> bytes:
+    return bytes(len(content))
+
+
+@pytest.mark.parametrize("damage", [torn, altered, zeros])
+def test_a_damaged_checkpoint_is_replaced_by_the_one_before_with_a_warning(
+    two: Path, damage: Callable[[bytes], bytes]
+) -> None:
+    two.write_bytes(damage(two.read_bytes()))
+    with pytest.warns(UserWarning, match=r"checkpoint\.pkl: .* continues from .*checkpoint\.previous\.pkl, at step 20"):
+        model, _ = load_checkpoint(two)
+    assert model.learn(5, reset_num_timesteps=False).num_timesteps == 25
+
+    older = two.with_name("checkpoint.previous.pkl")
+    older.write_bytes(damage(older.read_bytes()))
+    with pytest.raises(
+        ValueError, match=r"checkpoint\.pkl: this (checkpoint is torn or altered|is no checkpoint).* start again"
+    ):
+        load_checkpoint(two)
+
+
+def test_a_full_disk_keeps_only_the_newest_checkpoint(two: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=two.stat().st_size))
+    with replaced(two):
+        assert [path.name for path in two.parent.glob("checkpoint*")] == ["checkpoint.pkl"]
+
+
+def test_a_checkpoint_of_an_earlier_run_is_not_kept_as_the_one_before(two: Path) -> None:
+    two.unlink()  # to start again
+    save_checkpoint(two, make_model(**LEARNING))
+    assert [path.name for path in two.parent.iterdir()] == ["checkpoint.pkl"]
+
+
+@pytest.mark.parametrize("task", ["state", "pixels", "hindsight"])
+def test_other_versions_continue_in_new_episodes(task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "checkpoint.pkl"
+    if task == "hindsight":
+        model, env = hindsight_model(), hindsight_model().env
+    else:
+        model, env = model_of(task), {"state": state_task, "pixels": pixel_task}[task]()
+    model.learn(60)
+    with monkeypatch.context() as patched:
+        patched.setattr("sb3_robust_bisim.runs.checkpoint._versions", lambda: {"torch": "1.0"})
+        save_checkpoint(path, model)
+    with pytest.raises(ValueError, match=r"not possible, .*torch is 1\.0 there and 2.* pass env \(.* --new-episodes\)"):
+        load_checkpoint(path)
+
+    continued, context = load_checkpoint(path, env=env)
+    assert context is None
+    assert_equal_weights(continued, model)
+    assert (continued.num_timesteps, continued._n_updates) == (60, model._n_updates)
+    np.testing.assert_array_equal(continued.replay_buffer.rewards, model.replay_buffer.rewards)
+    if task == "state":
+        np.testing.assert_array_equal(continued.env.obs_rms.mean, model.env.obs_rms.mean)
+    assert continued.learn(20, reset_num_timesteps=False).num_timesteps == 80
 
 
 def test_resumed_training_with_hindsight_replay_equals_uninterrupted_training(tmp_path: Path) -> None:
-    def model() -> BisimSAC:
-        env = BitFlippingEnv(n_bits=4, continuous=True)
-        settings = dict(intrinsic_reward_scale=0.0, replay_buffer_class=HerReplayBuffer)
-        return make_model("MultiInputPolicy", env, **LEARNING, **settings)
-
-    expected = model().learn(60)
-    model().learn(60, callback=CallbackList([Checkpoint(tmp_path / "checkpoint.pkl", 30), StopAt(40)]))
+    expected = hindsight_model().learn(60)
+    hindsight_model().learn(60, callback=CallbackList([Checkpoint(tmp_path / "checkpoint.pkl", 30), StopAt(40)]))
     continued, _ = load_checkpoint(tmp_path / "checkpoint.pkl")
     continued.learn(60 - continued.num_timesteps, reset_num_timesteps=False)
-    for name, tensor in expected.policy.state_dict().items():
-        assert th.equal(tensor, continued.policy.state_dict()[name]), name
+    assert_equal_weights(continued, expected)
 
 
 def test_a_half_written_checkpoint_is_overwritten(tmp_path: Path) -> None:
@@ -165,16 +315,21 @@ def test_an_interval_of_no_steps_between_checkpoints_is_refused() -> None:
 
 
 @pytest.fixture
-def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def arguments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The arguments of a run that is cut off before it saves its agent. It leaves a checkpoint at step 50."""
     monkeypatch.setattr(zoo.BisimExperimentManager, "save_trained_model", lambda *_: None)
-    common = [
+    return [
         *("train", "--env", "robust_bisim/SparseCartPole-v0", "--eval-freq", "-1", "--verbose", "0", "--n-timesteps", "60"),
         *("--log-folder", str(tmp_path), "--checkpoint", str(tmp_path / "checkpoint.pkl"), "--checkpoint-freq", "50"),
         *("-params", "learning_starts:20", "batch_size:8"),
     ]
-    zoo.main([*common, "--seed", "3"])
-    return common
+
+
+@pytest.fixture
+def command(arguments: list[str]) -> list[str]:
+    """The same arguments, after a run with seed 3."""
+    zoo.main([*arguments, "--seed", "3"])
+    return arguments
 
 
 @pytest.mark.parametrize(
@@ -209,31 +364,44 @@ def test_a_resumed_run_may_be_longer(command: list[str], capsys: pytest.CaptureF
     assert "Going on from step 50" in capsys.readouterr().out
 
 
-def test_a_checkpoint_from_other_package_versions_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sb3_robust_bisim.runs.checkpoint._versions", lambda: {"torch": "1.0"})
-    save_checkpoint(tmp_path / "checkpoint.pkl", make_model(**LEARNING))
-    monkeypatch.undo()
-    with pytest.raises(ValueError, match=r"needs the versions that it was written with: .*torch is 1\.0 there and 2"):
-        load_checkpoint(tmp_path / "checkpoint.pkl")
+def test_the_command_line_continues_another_versions_checkpoint_in_new_episodes(
+    command: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("sb3_robust_bisim.runs.checkpoint._versions", lambda: {"torch": "3.0"})
+    with pytest.raises(ValueError, match="not possible, because it was written with other versions"):
+        zoo.main([*command, "--seed", "3"])
+    zoo.main([*command, "--seed", "3", "--new-episodes"])
+    printed = capsys.readouterr().out
+    assert "New episodes and a new log folder, because it was written with other versions" in printed
+    assert "Going on from step 50" in printed
+    assert len(list(tmp_path.glob("bisim_sac/*/0.monitor.csv"))) == 2
 
 
-def test_a_checkpoint_from_a_machine_with_more_gpus_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    save_checkpoint(tmp_path / "checkpoint.pkl", make_model(**LEARNING), about={"name": "a"})
-    assert read_about(tmp_path / "checkpoint.pkl")["gpus"] == 0
-    with (tmp_path / "checkpoint.pkl").open("rb") as file:
-        header, rest = pickle.load(file), file.read()
-    (tmp_path / "elsewhere.pkl").write_bytes(pickle.dumps({**header, "gpus": 99}) + rest)
-    with pytest.raises(ValueError, match=r"elsewhere\.pkl: written with 99 GPUs, here are \d"):
-        load_checkpoint(tmp_path / "elsewhere.pkl")
+def test_the_command_line_continues_environments_in_other_processes(
+    arguments: list[str], capsys: pytest.CaptureFixture
+) -> None:
+    for _ in range(2):
+        zoo.main([*arguments, "--seed", "3", "--vec-env", "subproc"])
+    assert "Going on from step 50" in capsys.readouterr().out
+
+
+def test_a_checkpoint_from_a_machine_with_more_gpus_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.pkl"
+    save_checkpoint(path, make_model(**LEARNING), about={"name": "a"})
+    about = read_about(path)
+    assert (about["name"], about["gpus"]) == ("a", 0)
+    with replaced(path) as file:
+        pickle.dump({**about, "gpus": 99}, file)
+    with pytest.raises(
+        ValueError, match=r"checkpoint\.pkl: .* not possible, because it was written with 99 GPUs, here are \d"
+    ):
+        load_checkpoint(path)
 
 
 def test_a_file_that_is_not_a_checkpoint_is_refused_by_name(command: list[str], tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.pkl"
     path.write_bytes(b"PK\x03\x04 a model, say")
-    with pytest.raises(ValueError, match=r"checkpoint\.pkl: this is no checkpoint. Name another file"):
-        zoo.main([*command, "--seed", "3"])
-    path.write_bytes(pickle.dumps([1, 2]))
-    with pytest.raises(ValueError, match=r"checkpoint\.pkl: this is no checkpoint, but some other pickle"):
+    with pytest.raises(ValueError, match=r"checkpoint\.pkl: this is no checkpoint.* Name another file"):
         zoo.main([*command, "--seed", "3"])
     save_checkpoint(path, make_model(**LEARNING))
     with pytest.raises(ValueError, match=r"--checkpoint .*checkpoint\.pkl: saved from Python, not by this command"):

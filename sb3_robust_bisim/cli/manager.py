@@ -20,7 +20,15 @@ from sb3_robust_bisim.bisim_sac import BisimSAC
 from sb3_robust_bisim.cli.record import record_or_explain
 from sb3_robust_bisim.cli.report import report
 from sb3_robust_bisim.cli.zoo_config import check_keys, check_task, entry_of, is_yaml, merged_policy_kwargs, variant_settings
-from sb3_robust_bisim.runs.checkpoint import Checkpoint, differences, load_checkpoint, read_about
+from sb3_robust_bisim.runs.checkpoint import (
+    Checkpoint,
+    delete_checkpoint,
+    differences,
+    load_checkpoint,
+    obstacle,
+    read_about,
+)
+from sb3_robust_bisim.runs.pickling import ResumableSubprocVecEnv
 
 ALGO = "bisim_sac"
 WEIGHTS = (("bisim_coef", 0.05, 5.0), ("intrinsic_reward_scale", 0.01, 20.0), ("inverse_dynamics_coef", 0.01, 20.0))
@@ -56,12 +64,14 @@ class RunOptions:
     :param variants: names of variants in the config file; the last one has the highest priority
     :param checkpoint: file from which an interrupted run continues
     :param checkpoint_freq: environment steps between two checkpoints
+    :param new_episodes: continue in new episodes if an exact continuation is not possible
     :param seed_given: the user has set a seed; otherwise rl-zoo3 draws one
     """
 
     variants: tuple[str, ...] = ()
     checkpoint: Path | None = None
     checkpoint_freq: int = 10_000
+    new_episodes: bool = False
     seed_given: bool = False
 
 
@@ -143,11 +153,13 @@ class BisimExperimentManager(ExperimentManager):
         if self.optimize_hyperparameters:
             raise ValueError("--checkpoint with -optimize: not supported. Optuna saves its trials itself, see --storage.")
         if self.vec_env_class is SubprocVecEnv:
-            raise ValueError(
-                "--checkpoint with --vec-env subproc: environments in other processes cannot be saved; use dummy."
-            )
+            self.vec_env_class = ResumableSubprocVecEnv
         if checkpoint.is_file():
             return self._continue(checkpoint)
+        return self._begin(checkpoint)
+
+    def _begin(self, checkpoint: Path) -> tuple[BaseAlgorithm, dict[str, Any]]:
+        """Create a run that writes checkpoints."""
         experiment = super().setup_experiment()
         assert experiment is not None  # it is only with -optimize
         run = {"save_path": self.save_path, "callbacks": self.callbacks}
@@ -162,7 +174,7 @@ class BisimExperimentManager(ExperimentManager):
 
     def _settings(self, hyperparams: dict[str, Any]) -> dict[str, Any]:
         """The settings that must stay the same for a run to be continued; it may become longer."""
-        keys = ("eval_freq", "eval_episodes", "n_eval_envs", "save_freq", "device")
+        keys = ("eval_freq", "eval_episodes", "n_eval_envs", "save_freq", "device", "vec_env")
         asked = {key: vars(self.args)[key] for key in keys}
         env_kwargs = {
             "env_kwargs": self.env_kwargs or hyperparams.get("env_kwargs", {}),
@@ -184,9 +196,14 @@ class BisimExperimentManager(ExperimentManager):
         _, self.env_wrapper, _, self.vec_env_wrapper = self._preprocess_hyperparams(hyperparams)
         if self.n_timesteps < about["num_timesteps"]:
             raise ValueError(f"--n-timesteps {self.n_timesteps}: {checkpoint} is at step {about['num_timesteps']} already.")
-        model, run = load_checkpoint(checkpoint)
-        self.save_path, self.callbacks = run["save_path"], run["callbacks"]
-        self.params_path = f"{self.save_path}/{self.env_name}"
+        if self.options.new_episodes and (reason := obstacle(about)):
+            new_model, saved_hyperparams = self._begin(checkpoint)
+            model, _ = load_checkpoint(checkpoint, env=new_model.env)
+            print(f"New episodes and a new log folder, because {reason}")
+        else:
+            model, run = load_checkpoint(checkpoint)
+            self.save_path, self.callbacks = run["save_path"], run["callbacks"]
+            self.params_path = f"{self.save_path}/{self.env_name}"
         self.resumed = True
         print(f"Going on from step {model.num_timesteps}, in {self.save_path}")
         return model, saved_hyperparams
@@ -212,7 +229,7 @@ class BisimExperimentManager(ExperimentManager):
         if model.num_timesteps < self.n_timesteps:
             print(f"Stopped at step {model.num_timesteps} of {self.n_timesteps}.")
         elif self.options.checkpoint is not None:
-            self.options.checkpoint.unlink(missing_ok=True)  # the run is complete
+            delete_checkpoint(self.options.checkpoint)  # the run is complete
         report(Path(self.save_path), title, -1 if self.continue_training else getattr(model, "learning_starts", -1))
         if self.algo == ALGO and is_image_space(model.observation_space):
             print(f"Video:          {record_or_explain(model, self._rendered_eval_env, Path(self.save_path))}")

@@ -94,6 +94,12 @@ def _train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, li
         "file to start again",
     )
     parser.add_argument(
+        "--new-episodes",
+        action="store_true",
+        help="continue from a checkpoint of other package versions or of a machine with more GPUs: with its agent, replay "
+        "buffer and counters, but in new episodes and with a new log folder. The numbers differ from an uninterrupted run",
+    )
+    parser.add_argument(
         "--checkpoint-freq",
         type=int,
         default=10_000,
@@ -105,6 +111,8 @@ def _train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, li
     ours, theirs = _parse(parser, arguments)
     if ours.checkpoint_freq < 1:
         parser.error(f"--checkpoint-freq {ours.checkpoint_freq}: must be at least 1.")
+    if ours.new_episodes and ours.checkpoint is None:
+        parser.error("--new-episodes: needs --checkpoint FILE.")
     if ours.checkpoint is not None:
         _check_writable(parser, ours.checkpoint)
     config = ours.conf_file or (str(DEFAULT_CONFIG) if ours.algo == ALGO else None)
@@ -115,7 +123,8 @@ def _train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, li
     if ours.seed is not None:
         theirs += ["--seed", str(ours.seed)]
     seed_given = ours.seed is not None and ours.seed >= 0
-    return RunOptions(tuple(ours.variants), ours.checkpoint, ours.checkpoint_freq, seed_given), theirs
+    options = RunOptions(tuple(ours.variants), ours.checkpoint, ours.checkpoint_freq, ours.new_episodes, seed_given)
+    return options, theirs
 
 
 def _enjoy_arguments(program: str, arguments: list[str]) -> list[str]:

@@ -2,39 +2,36 @@
 Checkpoints from which training continues as if it had never stopped.
 
 SB3's own ``save`` stores the agent. A checkpoint stores everything that influences later numbers in one file: agent and
-optimizers, replay buffer, environments in the middle of their episodes, callbacks with their state (if they are part of
-``context``), and the random generators of CPU and CUDA. A run that continues computes the same numbers, bit by bit, as a run
-without interruption. Three things differ: wall-clock times; the first line of every output of SB3's logger, because its means
-start again; and exploration with ``use_sde`` or action noise, because SB3 draws new noise in every call of ``learn``.
+optimizers, replay buffer, environments in the middle of their episodes, exploration noise, random generators of CPU and CUDA,
+and callbacks with their state if they are part of ``context``. A run that continues computes the same numbers, bit by bit, as
+a run without interruption. Two things differ: wall-clock times, and the first line of every output of SB3's logger, because
+its means start again.
 """
 
-import inspect
+import io
 import pickle
 import platform
-import random
+import warnings
 from collections.abc import Mapping
+from functools import partial
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
-import cloudpickle
-import gymnasium as gym
-import numpy as np
 import torch as th
-from gymnasium.utils import EzPickle
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
-from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.monitor import ResultsWriter
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnvWrapper
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_robust_bisim.runs.atomic import atomic_path
+from sb3_robust_bisim.runs.hashed_file import damage, opened, previous, replaced
+from sb3_robust_bisim.runs.pickling import Pickler, check_environments, generator_states, restore_generators
 
 
 class Checkpoint(BaseCallback):
     """
-    Writes checkpoints at regular intervals, between two rollouts. Each one replaces the previous one.
+    Writes checkpoints at regular intervals, between two rollouts. The last two are kept.
 
     :param path: file to write; it is replaced completely or not at all
     :param every: environment steps between two checkpoints, summed over all environments, >= 1
@@ -55,44 +52,73 @@ class Checkpoint(BaseCallback):
         self._last = 0
 
     def _on_training_start(self) -> None:
-        _check_environments(self.model)
+        check_environments(self.training_env)
         self._last = self.num_timesteps
 
     def _on_rollout_start(self) -> None:
         if self.num_timesteps - self._last >= self.every:
             self._last = self.num_timesteps
-            save_checkpoint(self.path, self.model, self.context, self.about)
+            save_checkpoint(self.path, self.model, self.context, self.about, rollout_begun=True)
 
     def _on_step(self) -> bool:
         return True
 
 
-def save_checkpoint(path: str | Path, model: BaseAlgorithm, context: Any = None, about: dict[str, Any] | None = None) -> None:
+def save_checkpoint(
+    path: str | Path,
+    model: BaseAlgorithm,
+    context: Any = None,
+    about: dict[str, Any] | None = None,
+    rollout_begun: bool = False,
+) -> None:
     """
     Save everything that influences later numbers.
 
-    :param path: file to write. An existing file is kept until the new one is complete. No other process may write it
+    :param path: file to write. An existing file is kept until the new one is complete, and then as the previous one if there
+        is space on the disk and the file system has hard links. No other process may write it
     :param model: the model, between two calls of ``collect_rollouts`` as in :class:`Checkpoint`
     :param context: other objects to save
     :param about: plain values for :func:`read_about`
-    :raises ValueError: for environments in other processes, and for environments that are pickled as the arguments of their
-        constructor (``EzPickle``: Gymnasium's MuJoCo and Box2D tasks, and Shimmy's), because they would start again
+    :param rollout_begun: True in the ``_on_rollout_start`` of a callback, False outside of ``learn``. At that point, SB3 has
+        drawn the exploration noise of the rollout, and does not draw it again when training continues
+    :raises ValueError: for environments that cannot be pickled; the message names the environment and the remedy
     """
-    _check_environments(model)
-    with atomic_path(path, alone=True) as temporary, temporary.open("wb") as file:
-        gpus = th.cuda.device_count() if model.device.type == "cuda" else 0
-        header = {"num_timesteps": model.num_timesteps, "versions": _versions(), "gpus": gpus}
+    gpus = th.cuda.device_count() if model.device.type == "cuda" else 0
+    header = {"num_timesteps": model.num_timesteps, "versions": _versions(), "gpus": gpus}
+    with replaced(Path(path)) as file:
         pickle.dump({**(about or {}), **header}, file)
-        _Pickler(file).dump((model, context, _generator_states(model.device)))
+        pickler = Pickler(file)  # it writes an object once that both dumps contain
+        try:
+            pickler.dump(_without_environment(model))
+            pickler.dump((model, context, generator_states(model.device), rollout_begun))
+        except Exception:
+            check_environments(model.env)  # type: ignore[arg-type]
+            raise
 
 
 def read_about(path: str | Path) -> dict[str, Any]:
-    """The plain values that were saved with a checkpoint, its ``"num_timesteps"`` and the packages' ``"versions"``."""
-    with Path(path).open("rb") as file:
-        return _read_header(file)
+    """
+    The plain values that were saved with a checkpoint, its ``"num_timesteps"`` and the packages' ``"versions"``.
+
+    :param path: as for :func:`load_checkpoint`, also if the file is damaged
+    """
+    with opened(_intact(Path(path))) as file:
+        return pickle.load(file)
 
 
-def load_checkpoint(path: str | Path) -> tuple[Any, Any]:
+def obstacle(about: Mapping[str, Any]) -> str:
+    """
+    :param about: what :func:`read_about` returned
+    :return: why a run cannot continue exactly here; empty if it can
+    """
+    if differing := differences(about["versions"], _versions()):
+        return f"it was written with other versions: {differing}"
+    if about["gpus"] > th.cuda.device_count():
+        return f"it was written with {about['gpus']} GPUs, here are {th.cuda.device_count()}"
+    return ""
+
+
+def load_checkpoint(path: str | Path, env: VecEnv | None = None) -> tuple[Any, Any]:
     """
     Load a model, and restore the global random generators.
 
@@ -102,26 +128,41 @@ def load_checkpoint(path: str | Path) -> tuple[Any, Any]:
     Loading changes no file. Once training continues, the first finished episode removes the episodes after the checkpoint from
     the Monitor file.
 
-    :param path: file that :func:`save_checkpoint` wrote
-    :return: the model with its environments and its replay buffer, and the context
-    :raises ValueError: if the file is not a checkpoint, or if it was written with other package versions or with more GPUs
+    :param path: file that :func:`save_checkpoint` wrote. If it is damaged and the previous one is not, a warning is given, and
+        the run continues from the previous one
+    :param env: new environments, to continue without exactness: the agent, its optimizers, replay buffer, counters and the
+        statistics of ``VecNormalize`` are loaded, and new episodes begin. The context and the random generators are not loaded
+    :return: the model with its environments and its replay buffer, and the context (None with ``env``)
+    :raises ValueError: if the file is not a checkpoint or damaged; without ``env``, if it was written with other package
+        versions or with more GPUs
     """
-    with Path(path).open("rb") as file:
-        about = _read_header(file)
-        if differing := differences(about["versions"], _versions()):
-            raise ValueError(f"{path}: a checkpoint needs the versions that it was written with: {differing}.")
-        if about["gpus"] > th.cuda.device_count():
-            raise ValueError(f"{path}: written with {about['gpus']} GPUs, here are {th.cuda.device_count()}; continue there.")
-        model, context, (python, numpy, torch, cuda) = cloudpickle.load(file)
+    path = _intact(Path(path))
+    with opened(path) as file:
+        if (reason := obstacle(pickle.load(file))) and env is None:
+            raise ValueError(
+                f"{path}: an exact continuation is not possible, because {reason}. Continue where it was written, or pass env "
+                "(on the command line --new-episodes), to continue with its agent, replay buffer and counters in new episodes."
+            )
+        unpickler = pickle.Unpickler(file)
+        parts = unpickler.load()
+        if env is not None:
+            return _with_new_episodes(parts, env), None
+        model, context, generators, rollout_begun = unpickler.load()
     model._custom_logger = False  # so that learn() creates a logger
-    if isinstance(model.replay_buffer, HerReplayBuffer):  # it does not pickle its environment
+    if isinstance(getattr(model, "replay_buffer", None), HerReplayBuffer):  # it does not pickle its environment
         model.replay_buffer.set_env(model.env)
-    random.setstate(python)
-    np.random.set_state(numpy)  # noqa: NPY002 (SB3 samples with it)
-    th.set_rng_state(torch)
-    if cuda:
-        th.cuda.set_rng_state_all(cuda)
+    if rollout_begun and model.use_sde:
+        _skip_next(getattr(model, "actor", model.policy), "reset_noise")
+    if rollout_begun and getattr(model, "action_noise", None) is not None:
+        _skip_next(model.action_noise, "reset")
+    restore_generators(generators)
     return model, context
+
+
+def delete_checkpoint(path: str | Path) -> None:
+    """Delete a checkpoint and the previous one, if they exist."""
+    Path(path).unlink(missing_ok=True)
+    previous(Path(path)).unlink(missing_ok=True)
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any], place: str = "here") -> str:
@@ -137,94 +178,51 @@ def differences(there: Mapping[str, Any], here: Mapping[str, Any], place: str = 
     return ", ".join(f"{key} is {there.get(key)} there and {here.get(key)} {place}" for key in keys)
 
 
-def _check_environments(model: BaseAlgorithm) -> None:
-    assert model.env is not None
-    venv = model.env.unwrapped
-    if isinstance(venv, SubprocVecEnv):
-        raise ValueError("SubprocVecEnv keeps its environments in other processes: use DummyVecEnv (--vec-env dummy).")
-    for env in getattr(venv, "envs", []):
-        layer = env
-        while isinstance(layer, gym.Wrapper) and not _begins_anew(layer):
-            layer = layer.env
-        if _begins_anew(layer):
-            raise ValueError(
-                f"{type(layer).__name__} is pickled as the arguments of its constructor (EzPickle): after a checkpoint it "
-                "would begin anew in the middle of an episode. Train without checkpoints, or define a __getstate__ that "
-                "keeps its state."
-            )
-
-
-def _begins_anew(env: gym.Env) -> bool:
-    return type(env).__getstate__ is EzPickle.__getstate__
-
-
-def _read_header(file: BinaryIO) -> dict[str, Any]:
-    try:
-        about = pickle.load(file)
-    except Exception as error:  # unpickling an arbitrary file can raise anything
-        raise ValueError(f"{file.name}: this is no checkpoint. Name another file.") from error
-    if not isinstance(about, dict) or not about.keys() >= {"num_timesteps", "versions", "gpus"}:
-        raise ValueError(f"{file.name}: this is no checkpoint, but some other pickle. Name another file.")
-    return about
+def _intact(path: Path) -> Path:
+    """The file itself, or the previous one if only that is whole."""
+    if not (problem := damage(path)):
+        return path
+    older = previous(path)
+    if not older.exists() or damage(older):
+        raise ValueError(f"{path}: {problem}. Name another file, or delete it to start again.")
+    with opened(older) as file:
+        step = pickle.load(file)["num_timesteps"]
+    warnings.warn(f"{path}: {problem}. The run continues from the checkpoint before, {older}, at step {step}.", stacklevel=3)
+    return older
 
 
 def _versions() -> dict[str, str]:
-    packages = ("torch", "numpy", "stable_baselines3", "gymnasium", "sb3_robust_bisim")
+    packages = ["torch", "numpy", "stable_baselines3", "gymnasium", "sb3_robust_bisim"]
+    packages += ["mujoco"] if find_spec("mujoco") else []  # it is optional
     return {"python": platform.python_version(), **{package: version(package) for package in packages}}
 
 
-def _generator_states(device: th.device) -> tuple[Any, ...]:
-    cuda = th.cuda.get_rng_state_all() if device.type == "cuda" else []
-    return random.getstate(), np.random.get_state(), th.get_rng_state(), cuda  # noqa: NPY002
+def _without_environment(model: BaseAlgorithm) -> tuple[Any, ...]:
+    """What :func:`_with_new_episodes` needs. The agent is in SB3's format, which other versions can read."""
+    agent = io.BytesIO()
+    model.save(agent)
+    normalize = model.get_vec_normalize_env()
+    statistics = None if normalize is None else (normalize.obs_rms, normalize.ret_rms)
+    return type(model), agent.getvalue(), model.device.type, getattr(model, "replay_buffer", None), statistics
 
 
-class _Pickler(cloudpickle.Pickler):
-    """Leaves out objects that belong to a process and are created again when training continues."""
-
-    def reducer_override(self, obj: Any) -> Any:
-        if isinstance(obj, Logger):  # it has open files; learn() creates another
-            return type(None), ()
-        if isinstance(obj, ProgressBarCallback):  # a bar on the screen
-            return ProgressBarCallback, ()
-        if isinstance(obj, BaseCallback):  # except the local and global variables of learn()
-            return _bare, (type(obj), {"locals": {}, "globals": {}}), _without(obj, "locals", "globals"), None, None, _fill
-        if isinstance(obj, VecEnvWrapper):  # except the members of its class; VecNormalize would drop its environment
-            return _bare_wrapper, (type(obj),), _without(obj, "class_attributes"), None, None, _fill
-        if isinstance(obj, ResultsWriter):
-            obj.file_handler.flush()
-            size = getattr(obj, "size", None)
-            size = obj.file_handler.tell() if size is None else size
-            return _ContinuedResults, (obj.file_handler.name, size, tuple(obj.logger.fieldnames)[3:])
-        return super().reducer_override(obj)
+def _with_new_episodes(parts: tuple[Any, ...], env: VecEnv) -> BaseAlgorithm:
+    algorithm, agent, device, replay_buffer, statistics = parts
+    model = algorithm.load(io.BytesIO(agent), env=env, device=device)
+    if replay_buffer is not None:
+        model.replay_buffer, replay_buffer.device = replay_buffer, model.device
+    if isinstance(replay_buffer, HerReplayBuffer):
+        replay_buffer.set_env(model.env)
+        replay_buffer.truncate_last_trajectory()
+    if statistics is not None and (normalize := model.get_vec_normalize_env()) is not None:
+        normalize.obs_rms, normalize.ret_rms = statistics
+    return model
 
 
-def _without(obj: Any, *names: str) -> dict[str, Any]:
-    return {name: value for name, value in vars(obj).items() if name not in names}
+def _skip_next(obj: Any, method: str) -> None:
+    """Make the next call of a method do nothing, because its effect is part of the checkpoint."""
+    setattr(obj, method, partial(_skipped, obj, method))
 
 
-def _fill(obj: Any, state: dict[str, Any]) -> None:
-    vars(obj).update(state)
-
-
-def _bare(cls: type, state: dict[str, Any]) -> Any:
-    obj: Any = object.__new__(cls)
-    _fill(obj, state)
-    return obj
-
-
-def _bare_wrapper(cls: type) -> Any:
-    return _bare(cls, {"class_attributes": dict(inspect.getmembers(cls))})
-
-
-class _ContinuedResults(ResultsWriter):
-    """A Monitor's file. The first new episode removes the episodes that ended after the checkpoint; they will be repeated."""
-
-    def __init__(self, name: str, size: int, extra_keys: tuple[str, ...]) -> None:
-        super().__init__(name, extra_keys=extra_keys, override_existing=False)
-        self.size: int | None = size  # size of the file at the checkpoint; None once it has been restored
-
-    def write_row(self, epinfo: dict[str, float]) -> None:
-        if self.size is not None:
-            self.file_handler.truncate(min(self.size, Path(self.file_handler.name).stat().st_size))
-            self.size = None
-        super().write_row(epinfo)
+def _skipped(obj: Any, method: str, *_: Any, **__: Any) -> None:
+    delattr(obj, method)

@@ -9,8 +9,9 @@ import numpy as np
 import torch as th
 
 from sb3_robust_bisim.bisim_sac import BisimSAC
-from sb3_robust_bisim.callbacks.diagnostic import EnvironmentCallback, Step, embed, undisturbed
+from sb3_robust_bisim.callbacks.diagnostic import EnvironmentCallback, embed, undisturbed
 from sb3_robust_bisim.envs.noise import NoiseObservation
+from sb3_robust_bisim.envs.pixels import PixelTask
 from sb3_robust_bisim.frame_buffer import frames_per_observation
 
 _STRIDE = 4  # steps between two anchors, because neighbours are nearly the same state
@@ -29,9 +30,8 @@ class DenoisingFactorCallback(EnvironmentCallback):
     drawn by :class:`~sb3_robust_bisim.envs.NoiseObservation` and mixed by its projection. In a stack of frames, each frame is
     drawn again.
 
-    On pixel tasks each state has a single positive, the frame without a distractor. The task provides it as
-    ``info["clean_obs"]`` with ``env_kwargs={"clean_obs": True}``. d_pos then measures the effect of one background, and in the
-    literature that of two, so these numbers cannot be compared with the literature.
+    On pixel tasks every anchor and every positive has its own distraction: another background, camera pose and colours, drawn
+    by :meth:`~sb3_robust_bisim.envs.pixels.PixelTask.look`. Those of a positive go on from frame to frame of a stack.
 
     ``eval_env_kwargs`` adds ``bisim/denoising_factor_heldout``: the same number for noise or backgrounds that training does
     not use. It is measured in a separate environment with the same start states, where the policy acts on the held-out noise.
@@ -42,11 +42,11 @@ class DenoisingFactorCallback(EnvironmentCallback):
     :param env_kwargs: merged into the arguments of the environment
     :param seed: seed of the environment; every measurement begins with the same start states
     :param verbose: as in SB3
-    :param n_positives: positives per state, >= 1 (literature: 16); pixel tasks have one
+    :param n_positives: positives per state, >= 1 (literature: 16). From pixels, each one is another frame to be drawn
     :param eval_env_kwargs: merged into ``env_kwargs`` for the held-out number, such as ``{"noise_mean": 1.0}`` or
         ``{"split": "eval"}``; None: no held-out number
     :raises ValueError: for an argument outside its range; at the start of training if the observation spaces differ, or if
-        the environment has neither noise nor clean frames
+        the environment has neither noise nor a visual distraction
 
     Example::
 
@@ -96,10 +96,11 @@ class DenoisingFactorCallback(EnvironmentCallback):
         super()._prepare()
         env = self.venv.unwrapped.envs[0]  # type: ignore[attr-defined]
         self._noise = _noise_layer(env)
-        if self._noise is None and "clean_obs" not in next(self._walk()).info:
+        self._task = env.unwrapped
+        if self._noise is None and not (isinstance(self._task, PixelTask) and self._task.distraction.parts):
             raise ValueError(
-                f'env_kwargs={self.env_kwargs}: no NoiseObservation and no info["clean_obs"], so a state cannot be observed '
-                "with different noise. Noisy tasks need noise_multiplier > 0, pixel tasks env_kwargs={'clean_obs': True}."
+                f"env_kwargs={self.env_kwargs}: nothing distracts in this environment, so a state cannot be observed with "
+                "different noise. Noisy tasks need noise_multiplier > 0, pixel tasks a distractor, such as 'video'."
             )
         if self._noise is not None and self._noise.observation_space != env.observation_space:
             raise ValueError(
@@ -132,15 +133,24 @@ class DenoisingFactorCallback(EnvironmentCallback):
             if step.done:
                 recent.clear()
                 continue
-            recent.append(self._positives(step))
+            recent.append(self._positives(first=not recent))
             if len(recent) == recent.maxlen:  # until then the stack contains zeros
                 yield [step.next_obs, *(_stack(frames, step.next_obs.shape) for frames in zip(*recent, strict=True))]
 
-    def _positives(self, step: Step) -> list[np.ndarray]:
-        """Single frames of the state after a step: with new noise, or one without a distractor."""
+    def _positives(self, first: bool) -> list[np.ndarray]:
+        """
+        Single frames of the current state, each with its own noise or distraction.
+
+        :param first: an episode has begun
+        """
         if self._noise is not None:
             return [self._noise.look() for _ in range(self.n_positives)]
-        return [step.info["clean_obs"]]
+        if first:
+            self._distractions = [self._task.distraction.another() for _ in range(self.n_positives)]
+        else:
+            for distraction in self._distractions:
+                distraction.step()
+        return [self._task.look(distraction) for distraction in self._distractions]
 
 
 def denoising_factor(anchors: th.Tensor, positives: th.Tensor) -> float:

@@ -31,7 +31,6 @@ class Distractors(ABC):
 
     defaults: ClassVar[EnvKwargs] = {}  # the arguments that are the distraction, with the environment's defaults
     given_allowed: tuple[str, ...] = ()  # those of them that the command line may set
-    for_denoising: ClassVar[dict[str, Any]] = {}  # arguments that the denoising factor needs
     choices: tuple[str, ...]  # parts, for help and error messages
     suggested: tuple[str, ...]  # names
 
@@ -143,7 +142,6 @@ class Scene(Distractors):
         for key in ("distractor", "split", *FILES, "camera_distraction", "color_distraction", "dynamic")
     }
     given_allowed = FILES
-    for_denoising: ClassVar[dict[str, Any]] = {"clean_obs": True}
     suggested = (
         *("clean", "video-train", "video-heldout", "images-heldout", "noise", "balls", "color"),
         *(f"{part}-{scale}" for part in ("camera", "color") for scale in SCALES),

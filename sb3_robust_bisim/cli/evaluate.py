@@ -161,7 +161,7 @@ def _play(
         factor = NAN
         # the callback cannot copy other wrappers
         if isinstance(model, BisimSAC) and distractors.distracts(env_kwargs) and "env_wrapper" not in agent.hyperparams:
-            look = DenoisingFactorCallback(n_states=args.n_states, env_kwargs=distractors.for_denoising, seed=args.seed)
+            look = DenoisingFactorCallback(n_states=args.n_states, seed=args.seed)
             factor = look.factor_of(model)
     return tuple(map(float, returns)), factor  # type: ignore[arg-type]
 

@@ -20,6 +20,7 @@ MAY_KNOW: dict[str, set[str]] = {
     "frame_buffer": {"runs"},
     "intrinsic_reward": set(),
     "update_log": set(),
+    "data_checks": set(),
     "envs": {"runs"},
     "theory": set(),
     "runs": set(),
@@ -31,7 +32,7 @@ MAY_KNOW: dict[str, set[str]] = {
     "heads": {"encoders"},
     "policies": {"augmentation", "encoders", "heads", "latent_models", "objective", "representation"},
     "checks": {"policies"},
-    "bisim_sac": {"checks", "heads", "intrinsic_reward", "objective", "policies", "representation", "runs", "update_log"},
+    "bisim_sac": {"checks", "data_checks", "heads", "intrinsic_reward", "objective", "policies", "runs", "update_log"},
     "callbacks": {"bisim_sac", "encoders", "envs", "frame_buffer", "losses", "theory"},
     "cli": {"bisim_sac", "checks", "frame_buffer", "runs"},
 }

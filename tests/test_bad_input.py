@@ -188,6 +188,18 @@ def test_a_bonus_below_a_frame_stack_is_refused(policy: str, env: Callable[[], g
         make_model(policy, VecFrameStack(IntrinsicRewardVecEnv(DummyVecEnv([env])), 2))
 
 
+@pytest.mark.parametrize(
+    ("policy", "env", "outside"),
+    [
+        ("MlpPolicy", lambda: VecFrameStack(VecNormalize(venv(), norm_reward=False), 2), "VecFrameStack"),
+        ("CnnPolicy", lambda: VecNormalize(DummyVecEnv([images]), norm_obs=False, norm_reward=False), "VecTransposeImage"),
+    ],
+)
+def test_vec_normalize_inside_of_what_changes_shapes_is_refused(policy: str, env: Callable[[], VecEnv], outside: str) -> None:
+    with pytest.raises(ValueError, match=f"VecNormalize inside of {outside}, .* Make VecNormalize the outermost"):
+        make_model(policy, env(), intrinsic_reward_scale=0.0)
+
+
 def test_set_env_refuses_another_number_of_environments_and_binds_nothing() -> None:
     model, other = make_model(intrinsic_reward_scale=1.0), IntrinsicRewardVecEnv(DummyVecEnv([pendulum, pendulum]))
     with pytest.raises(AssertionError, match="number of environments"):

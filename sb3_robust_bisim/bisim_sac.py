@@ -1,5 +1,4 @@
 import inspect
-from dataclasses import fields
 from typing import Any, Self
 
 import numpy as np
@@ -9,7 +8,8 @@ from stable_baselines3.common.utils import check_for_correct_spaces, polyak_upda
 from stable_baselines3.sac.sac import SAC
 from torch.nn import functional as F
 
-from sb3_robust_bisim.checks import check_arguments, check_names
+from sb3_robust_bisim.checks import check_arguments, check_names, checked_env
+from sb3_robust_bisim.data_checks import checked
 from sb3_robust_bisim.heads import BisimActor, BisimCritic
 from sb3_robust_bisim.intrinsic_reward import bound, with_intrinsic_reward
 from sb3_robust_bisim.objective import Objective
@@ -32,7 +32,7 @@ class BisimSAC(SAC):
     :param c_r: c_R, weight of the reward gap in the metric, >= 0
     :param c_t: c_T, weight of the transition term, in [0, 1). None: ``gamma``
     :param reward_range: (R_min, R_max) of one agent step: action repeat sums rewards. It sets the radius of the norm
-        constraint. The bonus is not counted, and the paper takes (0, 1) for all its tasks
+        constraint. The bonus is not counted; the paper takes (0, 1) for all its tasks. ``learn()`` warns if it is too narrow
     :param norm_constraint: hold embeddings and predictions in the L2 ball of eq:constraint, with radius
         c_R (R_max - R_min) / (2 (1 - c_T)). Between points of it only ``distance="l2"`` is at most the metric's diameter.
         "sphere": scale embeddings to length 1 (SimSR)
@@ -55,8 +55,8 @@ class BisimSAC(SAC):
         docs/performance.md). Heads, models and losses stay in fp32
     :param kwargs: the arguments of :class:`stable_baselines3.SAC`; ``n_steps`` must stay 1
 
-    :raises ValueError: for a value outside its range, ``n_steps`` other than 1, image observations with MlpPolicy, a
-        VecNormalize that normalises rewards, an IntrinsicRewardVecEnv outside of VecNormalize, HER with a bonus
+    :raises ValueError: for a value outside its range, arguments that contradict each other, and wrappers in a wrong order or
+        that normalise rewards; from ``learn()`` for an observation, a reward, an action or a loss that is not finite
     :raises TypeError: for an argument that does not exist
 
     Example::
@@ -100,7 +100,7 @@ class BisimSAC(SAC):
         check_names(BisimSAC, kwargs)
         if kwargs.get("policy_kwargs") is not None:
             kwargs["policy_kwargs"] = dict(kwargs["policy_kwargs"])  # SB3 writes into it
-        super().__init__(policy, env, _init_setup_model=False, **kwargs)
+        super().__init__(policy, checked_env(env, kwargs.get("verbose", 0)), _init_setup_model=False, **kwargs)
         self.bisim_coef = bisim_coef
         self.c_r = c_r
         self.c_t = c_t
@@ -124,10 +124,7 @@ class BisimSAC(SAC):
             self._setup_model()
 
     def _setup_model(self) -> None:
-        if self.c_t is None and not 0 <= self.gamma < 1:
-            raise ValueError(f"gamma={self.gamma}: it must be in [0, 1) when c_t is None, which stands for gamma.")
-        settings = {field.name: getattr(self, field.name) for field in fields(Objective)}
-        objective = Objective(**{**settings, "c_t": self.gamma if self.c_t is None else self.c_t})
+        objective = Objective.of(self)
         check_arguments(self)
         if self.env is not None:
             self.env = with_intrinsic_reward(self.env, self.observation_space, self.intrinsic_reward_scale)
@@ -251,7 +248,8 @@ class BisimSAC(SAC):
         if representation.objective.bisim_coef > 0:
             self.logger.record("bisim/mu_ratio_target", representation.objective.ratio_target)
         if gradient_steps > 0:
-            log.add(self._n_updates, representation.statistics(batch.z.detach()))
+            norm = th.nn.utils.get_total_norm([param.detach() for param in self.policy.parameters()])
+            log.add(self._n_updates, {**representation.statistics(batch.z.detach()), "train/parameter_norm": norm})
             log.record(self.logger)
 
     def _intrinsic_reward(self, obs: Any, actions: np.ndarray, next_obs: Any) -> np.ndarray:
@@ -283,7 +281,9 @@ class BisimSAC(SAC):
         progress_bar: bool = False,
     ) -> Self:
         with bound(self.env, self._intrinsic_reward if self.intrinsic_reward_scale > 0 else None):
-            return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+            return super().learn(
+                total_timesteps, checked(callback), log_interval, tb_log_name, reset_num_timesteps, progress_bar
+            )
 
     def save(self, path: PathOrStream, *args: Any, **kwargs: Any) -> None:
         """Like SB3's ``save``; a file that existed before stays whole until the new one is."""

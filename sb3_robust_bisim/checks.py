@@ -10,11 +10,15 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.sac.sac import SAC
 
 from sb3_robust_bisim.policies import BisimPolicy, MlpPolicy, MultiInputPolicy
+
+# The smallest value of each integer argument
+LEAST = dict(policy_delay=1, initial_gradient_steps=0, batch_size=1, buffer_size=1, target_update_interval=1)
 
 
 def check_arguments(model: Any) -> None:
@@ -23,11 +27,19 @@ def check_arguments(model: Any) -> None:
     :raises ValueError: for an argument outside its range, or arguments that contradict each other
     """
     _require(isinstance(model.bf16, (bool, np.bool_)), model, "bf16", "True or False")
-    for name, least in (("policy_delay", 1), ("initial_gradient_steps", 0)):
-        value = getattr(model, name)
-        whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-        _require(whole and value >= least, model, name, f"an integer >= {least}")
-
+    for name, least in LEAST.items():
+        _require(_is_whole(getattr(model, name), least), model, name, f"an integer >= {least}")
+    _require(_is_whole(model.gradient_steps, -1), model, "gradient_steps", "an integer >= 0, or -1 for one per step")
+    _require(_is_number(model.learning_starts) and model.learning_starts >= 0, model, "learning_starts", "a number >= 0")
+    _require(_is_number(model.gamma) and 0 <= model.gamma <= 1, model, "gamma", "in [0, 1]")
+    _require(_is_number(model.tau) and 0 <= model.tau <= 1, model, "tau", "in [0, 1]")
+    _check_train_freq(model)
+    if model.buffer_size < model.batch_size:
+        warnings.warn(
+            f"buffer_size={model.buffer_size} is below batch_size={model.batch_size}: every batch repeats transitions. Raise "
+            "buffer_size or lower batch_size.",
+            stacklevel=4,
+        )
     if model.bf16 and model.device.type == "cpu" and not getattr(th.ops.mkldnn, "_is_mkldnn_bf16_supported", bool)():
         warnings.warn("bf16=True: this CPU has no bfloat16 instructions, so fp32 is several times faster.", stacklevel=4)
     _check_random_shift(model.random_shift, model.observation_space)
@@ -62,6 +74,41 @@ def check_arguments(model: Any) -> None:
         _check_policy_fits(model)
 
 
+def _check_train_freq(model: Any) -> None:
+    value = model.train_freq  # a TrainFreq in a loaded model
+    count, unit = value if isinstance(value, tuple) and len(value) == 2 else (value, "step")
+    unit = getattr(unit, "value", unit)
+    valid = _is_whole(count, 1) and unit in ("step", "episode")
+    _require(valid, model, "train_freq", 'n, (n, "step") or (n, "episode"), with an integer n >= 1')
+    if unit == "episode" and model.n_envs > 1:
+        raise ValueError(
+            f"train_freq={tuple(value)} with {model.n_envs} environments: their episodes end at different times. Use "
+            '(n, "step"), or one environment.'
+        )
+
+
+def checked_env(env: Any, verbose: int) -> Any:
+    """
+    :param env: an environment, its id, or None
+    :return: the environment, made if it was an id
+    :raises ValueError: unless actions are a Box with bounds
+    """
+    env = maybe_make_env(env, verbose)
+    space = getattr(env, "action_space", None)
+    if space is None:
+        return env
+    if not isinstance(space, spaces.Box):
+        raise ValueError(
+            f"action_space={space}: BisimSAC needs continuous actions, a Box. For discrete ones use SB3's DQN or PPO."
+        )
+    if not (np.isfinite([space.low, space.high]).all() and (space.low < space.high).all()):
+        raise ValueError(
+            f"action_space={space}: SAC scales actions to [-1, 1], so all bounds must be finite, with low < high. Use "
+            "gymnasium.wrappers.RescaleAction or correct the environment."
+        )
+    return env
+
+
 def _check_random_shift(pad: Any, space: spaces.Space) -> None:
     if not isinstance(pad, (int, np.integer)) or isinstance(pad, bool) or pad < 0:
         raise ValueError(f"random_shift={pad!r}: it must be an integer in [0, image size), 0 for none.")
@@ -80,6 +127,14 @@ def _check_policy_fits(model: Any) -> None:
         raise ValueError(f"policy={name} with observations {space}: {remedy}.")
     if model.policy_class is MlpPolicy and is_image_space(space):
         raise ValueError(f'policy="MlpPolicy" with images {space}: use "CnnPolicy".')
+
+
+def _is_whole(value: Any, least: int) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= least)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
 
 
 def _require(condition: Any, model: Any, name: str, remedy: str) -> None:

@@ -104,8 +104,8 @@ def with_intrinsic_reward(env: VecEnv, observation_space: spaces.Space, scale: f
     :param observation_space: the agent's observation space
     :param scale: weight of the bonus; 0: no wrapper is needed
     :return: the chain
-    :raises ValueError: if rewards are normalised, if the wrapper's rewards would be ignored, or if its observations differ
-        from the agent's
+    :raises ValueError: if rewards are normalised, if the wrapper's rewards would be ignored, or if its observations or
+        VecNormalize's differ from the agent's
     """
     chain, layer = [], env
     while isinstance(layer, VecEnvWrapper):
@@ -118,6 +118,12 @@ def with_intrinsic_reward(env: VecEnv, observation_space: spaces.Space, scale: f
         raise ValueError(
             "VecNormalize(norm_reward=True): it rescales rewards during training, so neither the metric nor reward_range "
             "has a fixed unit. Pass norm_reward=False."
+        )
+    if normalize is not None and _shapes(normalize.observation_space) != _shapes(env.observation_space):
+        raise ValueError(
+            f"VecNormalize inside of {type(env).__name__}, which changes the shape of observations: SB3 would store them as "
+            "VecNormalize sees them. Make VecNormalize the outermost of both; for images with the channels last, use "
+            "VecNormalize(VecTransposeImage(venv), ...)."
         )
     if wrapper is not None and normalize is not None and chain.index(wrapper) < chain.index(normalize):
         raise ValueError(f"IntrinsicRewardVecEnv outside of VecNormalize: its rewards would be ignored; {remedy}")
@@ -134,6 +140,11 @@ def with_intrinsic_reward(env: VecEnv, observation_space: spaces.Space, scale: f
             "wrapper that changes their shape, such as VecFrameStack."
         )
     return env
+
+
+def _shapes(space: spaces.Space) -> Any:
+    """Shape of an observation, per key."""
+    return {key: _shapes(subspace) for key, subspace in space.items()} if isinstance(space, spaces.Dict) else space.shape
 
 
 def _sizes(space: spaces.Space) -> Any:

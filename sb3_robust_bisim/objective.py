@@ -1,7 +1,7 @@
 """Settings of what shapes the embedding beside the critic, checked before any work starts."""
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -32,6 +32,17 @@ class Objective:
     intrinsic_reward_max: float
     inverse_dynamics_coef: float
     metric_kwargs: dict[str, Any] | None
+
+    @classmethod
+    def of(cls, model: Any) -> Self:
+        """
+        :param model: a BisimSAC
+        :return: its settings
+        """
+        if model.c_t is None and not 0 <= model.gamma < 1:
+            raise ValueError(f"gamma={model.gamma}: it must be in [0, 1) when c_t is None, which stands for gamma.")
+        settings = {field.name: getattr(model, field.name) for field in fields(cls)}
+        return cls(**{**settings, "c_t": model.gamma if model.c_t is None else model.c_t})
 
     def __post_init__(self) -> None:
         is_dict = self.metric_kwargs is None or isinstance(self.metric_kwargs, dict)
@@ -98,11 +109,15 @@ class Objective:
 
     @property
     def radius(self) -> float | None:
-        """Radius of the ball that holds the embeddings (eq:constraint), None without one. Absorbing states pay 0."""
-        r_min, r_max = self.reward_range
+        """Radius of the ball that holds the embeddings (eq:constraint), None without one."""
+        return self.radius_of(self.reward_range) if self.in_ball else None
+
+    def radius_of(self, reward_range: tuple[float, float]) -> float:
+        """The radius that rewards of this range need. Absorbing states pay 0."""
+        r_min, r_max = reward_range
         if self.metric.absorbing:
             r_min, r_max = min(r_min, 0.0), max(r_max, 0.0)
-        return ball_radius(self.c_r, self.c_t, (r_min, r_max)) if self.in_ball else None
+        return ball_radius(self.c_r, self.c_t, (r_min, r_max))
 
     @property
     def ratio_target(self) -> float:

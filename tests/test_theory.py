@@ -1,6 +1,8 @@
 """Exact bisimulation metrics of finite MDPs agree with hand calculations and independent solvers, and obey their axioms."""
 
 import re
+import runpy
+import sys
 import time
 from typing import Any
 
@@ -383,6 +385,11 @@ class TestBadInput:
     def test_aggregation_names_what_is_wrong(self, arguments: dict[str, Any], message: str) -> None:
         with pytest.raises(ValueError, match=re.escape(message)):
             aggregate(SWITCH, np.full((2, 2), 0.5), **arguments)
+
+    def test_a_missing_package_is_named(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setitem(sys.modules, "ot", None)
+        with pytest.raises(ImportError, match=r"need the extra `theory`: pip install sb3_robust_bisim\[theory\]"):
+            runpy.run_path(str(solver.__file__))
 
     def test_arrays_of_an_mdp_cannot_be_changed(self) -> None:
         with pytest.raises(ValueError, match="read-only"):

@@ -242,6 +242,15 @@ def test_a_config_may_be_python(zoo: Zoo, tmp_path: Path) -> None:
     study = ["--storage", f"sqlite:///{tmp_path}/study.db", "--study-name", "pendulum", "--trial-id", "1"]
     with pytest.raises(ValueError, match=r"config\.py: --trial-id needs a YAML file"):
         zoo(*common, *study)
+    with pytest.raises(ValueError, match=r"config\.py: --variant needs a YAML file"):
+        zoo(*common, "--variant", "SAC")
+
+
+def test_a_command_that_needs_an_extra_says_so(zoo: Zoo, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(rl_zoo3, "plots", raising=False)
+    monkeypatch.setitem(sys.modules, "rl_zoo3.plots", None)
+    with pytest.raises(ImportError, match=r"plot_train needs the extra `plots`: pip install sb3_robust_bisim\[plots\]"):
+        zoo("plot_train")
 
 
 def test_a_run_that_was_stopped_says_so(zoo: Zoo, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from torch.nn import functional as F
 
 from sb3_robust_bisim.checks import check_arguments, check_names, checked_env
 from sb3_robust_bisim.data_checks import checked
+from sb3_robust_bisim.frame_buffer import choose_buffer
 from sb3_robust_bisim.heads import BisimActor, BisimCritic
 from sb3_robust_bisim.intrinsic_reward import bound, with_intrinsic_reward
 from sb3_robust_bisim.objective import Objective
@@ -21,10 +22,8 @@ from sb3_robust_bisim.update_log import UpdateLog, unchecked_distributions
 class BisimSAC(SAC):
     """
     Soft Actor-Critic whose encoder is shaped by a robust on-policy bisimulation metric (Kemertas and Aumentado-Armstrong,
-    Towards Robust Bisimulation Metric Learning, NeurIPS 2021).
-
-    One encoder z = phi(s), owned by the critic, is trained by critic, metric, dynamics, reward and inverse-dynamics loss in
-    one backward pass, and never by the actor loss. zoo_configs/bisim_sac.yml names the settings of each method.
+    2021). One encoder z = phi(s), owned by the critic, is trained by critic, metric, dynamics, reward and inverse-dynamics
+    loss in one backward pass, and never by the actor loss. zoo_configs/bisim_sac.yml names the settings of each method.
 
     :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a subclass of ``BisimPolicy``
     :param env: the environment, or its id
@@ -53,8 +52,8 @@ class BisimSAC(SAC):
     :param random_shift: shift the images of each batch by up to this many pixels (DrQ), s and s' apart; 0 turns it off
     :param bf16: run the encoder under bfloat16 autocast: faster from pixels on a GPU, or a CPU that has it (see
         docs/performance.md). Heads, models and losses stay in fp32
-    :param kwargs: the arguments of :class:`stable_baselines3.SAC`; ``n_steps`` must stay 1
-
+    :param kwargs: the arguments of :class:`stable_baselines3.SAC`; ``n_steps`` must stay 1. Byte images go to a
+        :class:`~sb3_robust_bisim.FrameStackReplayBuffer` unless another ``replay_buffer_class`` is named
     :raises ValueError: for a value outside its range, arguments that contradict each other, and wrappers in a wrong order or
         that normalise rewards; from ``learn()`` for an observation, a reward, an action or a loss that is not finite
     :raises TypeError: for an argument that does not exist
@@ -128,6 +127,7 @@ class BisimSAC(SAC):
         check_arguments(self)
         if self.env is not None:
             self.env = with_intrinsic_reward(self.env, self.observation_space, self.intrinsic_reward_scale)
+        choose_buffer(self)
         # here and not in __init__: `load(..., c_t=0.5)` reaches the policy, and the user's dict is saved as it was given
         policy_kwargs = self.policy_kwargs
         self.policy_kwargs = {**policy_kwargs, "objective": objective, "bf16": self.bf16, "random_shift": self.random_shift}

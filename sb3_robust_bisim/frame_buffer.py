@@ -9,7 +9,8 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.preprocessing import is_image_space_channels_first
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
 
@@ -95,7 +96,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
         if psutil is not None and n_bytes > (available := psutil.virtual_memory().available):
             # The system provides memory only when it is written to: without a warning, the run would fail late
             message = f"The full replay buffer needs {n_bytes / 1e9:.2f} GB, but {available / 1e9:.2f} GB are available"
-            warnings.warn(f"{message}: lower buffer_size.", stacklevel=2)
+            fits = int(0.9 * available / n_bytes * buffer_size)
+            warnings.warn(f"{message}: lower buffer_size={buffer_size} to {fits}.", stacklevel=2)
 
     def _allocate(self, n_used: int = 0) -> None:
         """Allocate memory for at least ``n_used`` frames. The system provides it only when it is written to."""
@@ -279,6 +281,23 @@ def frames_per_observation(venv: VecEnv) -> int:
     """Number of frames that a chain of wrappers stacks; 1 without a VecFrameStack."""
     stack = unwrap_vec_wrapper(venv, VecFrameStack)
     return 1 if stack is None else stack.stacked_obs.n_stack
+
+
+def choose_buffer(model: OffPolicyAlgorithm) -> None:
+    """
+    Give an agent that observes byte images, and for which no buffer has been named, one that stores each frame once.
+
+    :param model: algorithm whose environment is known, before its buffer is made
+    """
+    space = model.observation_space
+    bytes_ = isinstance(space, spaces.Box) and space.dtype == np.uint8 and is_image_space(space)
+    if model.replay_buffer_class is not None or model.env is None or not bytes_:
+        return
+    model.replay_buffer_class = FrameStackReplayBuffer
+    model.replay_buffer_kwargs = {"n_stack": frames_per_observation(model.env), **model.replay_buffer_kwargs}
+    if model.verbose > 0:
+        n_stack = model.replay_buffer_kwargs["n_stack"]
+        print(f"Using a FrameStackReplayBuffer with n_stack={n_stack}, which stores each frame once")
 
 
 def _check_space(observation_space: spaces.Space, n_stack: int) -> bool:

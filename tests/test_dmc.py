@@ -4,6 +4,7 @@ import importlib.util
 import os
 import subprocess
 import sys
+import warnings
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
 import sb3_robust_bisim.envs  # noqa: F401
+from sb3_robust_bisim.envs import pixels
 from sb3_robust_bisim.envs.distractors import ColorDistractor
 from sb3_robust_bisim.envs.dmc import SUITE
 from sb3_robust_bisim.envs.pixels import PixelTask
@@ -249,6 +251,16 @@ def test_render_shows_the_distractor_at_any_size() -> None:
     assert env.metadata["render_fps"] == 25  # 0.01 s per control step, four of which make a step
 
 
+@pytest.mark.parametrize("gpu", [True, False])
+def test_without_a_gpu_shadows_are_said_to_be_slow(gpu: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pixels, "has_gpu", lambda: gpu)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for kwargs in ({}, {"shadows": False}, {"distractor": "color"}):
+            make("cheetah-run", **kwargs).close()
+    assert sum("shadows=False draws" in str(warning.message) for warning in caught) == (0 if gpu else 1)
+
+
 def test_frames_without_shadows_still_show_sky_and_ground() -> None:
     stock, fast = (play(make("cartpole-swingup", shadows=shadows), seed=0)["observations"] for shadows in (True, False))
     difference = np.abs(stock.astype(int) - fast)
@@ -398,6 +410,7 @@ def test_tasks_work_after_an_earlier_import_of_dm_control() -> None:
 def test_the_ids_are_registered_without_importing_anything_of_the_extra() -> None:
     code = """
 import sys
+import warnings
 class Missing:
     def find_spec(self, name, path=None, target=None):
         if name.split(".")[0] in ("mujoco", "dm_control", "shimmy", "imageio_ffmpeg", "skvideo"):

@@ -16,8 +16,10 @@ import torch as th
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_models import dicts, images, make_model
 from stable_baselines3 import SAC
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize, VecTransposeImage
 
@@ -390,6 +392,23 @@ def test_the_error_for_an_environment_without_frame_stack_names_the_remedy() -> 
 
 def test_a_buffer_larger_than_the_memory_causes_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     psutil = pytest.importorskip("psutil")
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=1000))
-    with pytest.warns(UserWarning, match="lower buffer_size"):
-        FrameStackReplayBuffer(10, image_space(9), ACTION_SPACE)
+    n_bytes = 1000 * 3 * HEIGHT * WIDTH
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=n_bytes // 2))
+    with pytest.warns(UserWarning, match="lower buffer_size=1000 to 4[45][0-9]"):  # nine tenths of half
+        FrameStackReplayBuffer(1000, image_space(9), ACTION_SPACE)
+
+
+@pytest.mark.parametrize("n_stack", [1, 3])
+def test_bisim_sac_stores_each_frame_of_byte_images_once_and_says_so(n_stack: int, capsys: pytest.CaptureFixture) -> None:
+    venv = make_vec_env(images)
+    model = make_model("CnnPolicy", venv if n_stack == 1 else VecFrameStack(venv, n_stack), verbose=1)
+    assert isinstance(model.replay_buffer, FrameStackReplayBuffer)
+    assert model.replay_buffer.n_stack == n_stack
+    assert capsys.readouterr().out.count(f"Using a FrameStackReplayBuffer with n_stack={n_stack}") == 1
+    model.learn(30)
+
+
+def test_another_buffer_is_kept_if_it_is_named_or_observations_are_no_byte_images() -> None:
+    assert type(make_model("CnnPolicy", images(), replay_buffer_class=ReplayBuffer).replay_buffer) is ReplayBuffer
+    assert type(make_model().replay_buffer) is ReplayBuffer
+    assert type(make_model("MultiInputPolicy", dicts()).replay_buffer) is DictReplayBuffer

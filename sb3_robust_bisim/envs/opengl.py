@@ -1,6 +1,7 @@
 """Choose how MuJoCo draws without a display: EGL if its library is installed, else OSMesa."""
 
 import ctypes.util
+import glob
 import importlib
 import importlib.util
 import os
@@ -44,6 +45,11 @@ def import_suite(rendering: bool) -> None:
     except (ImportError, AttributeError, RuntimeError) as error:
         # PyOpenGL raises an AttributeError if it cannot load a library
         raise _cannot_draw(error) from error
+
+
+def has_gpu() -> bool:
+    """Whether the system shows a graphics processor; without one, OpenGL draws on the CPU."""
+    return sys.platform != "linux" or any(glob.glob(device) for device in ("/dev/dri/render*", "/dev/nvidia[0-9]*"))
 
 
 def rendering_contexts(physics: Any) -> Any:

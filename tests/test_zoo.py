@@ -132,7 +132,7 @@ def test_training_from_pixels_ends_with_a_video_and_what_the_agent_sees(zoo: Zoo
     import imageio.v2 as imageio
 
     output = zoo(
-        *("train", "--env", "robust_bisim/cartpole-swingup-pixels-v0", "--variant", "small", "-n", "40", "--eval-freq", "20"),
+        *("train", "--env", "robust_bisim/cartpole-swingup-pixels-v0", "--variant", "small", "balanced", "-n", "40", "--eval-freq", "20"),
         *("--env-kwargs", "distractor:'video'", "action_repeat:50", "--eval-episodes", "1", "-f", str(tmp_path)),
         *("-params", "learning_starts:20", "batch_size:4", "buffer_size:60", "n_envs:2"),
     )
@@ -147,6 +147,7 @@ def test_training_from_pixels_ends_with_a_video_and_what_the_agent_sees(zoo: Zoo
     assert imageio.imread(run / "what_the_agent_sees.png").shape == (3 * 84, 8 * 84, 3)
     model = BisimSAC.load(run / "robust_bisim-cartpole-swingup-pixels-v0.zip")
     assert model.replay_buffer_class is FrameStackReplayBuffer
+    assert (model.c_r, model.bisim_coef) == (0.02, 100.0)
     assert model.observation_space.shape == (9, 84, 84)
 
 

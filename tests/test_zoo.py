@@ -132,7 +132,8 @@ def test_training_from_pixels_ends_with_a_video_and_what_the_agent_sees(zoo: Zoo
     import imageio.v2 as imageio
 
     output = zoo(
-        *("train", "--env", "robust_bisim/cartpole-swingup-pixels-v0", "--variant", "small", "balanced", "-n", "40", "--eval-freq", "20"),
+        *("train", "--env", "robust_bisim/cartpole-swingup-pixels-v0", "--variant", "small", "balanced"),
+        *("-n", "40", "--eval-freq", "20"),
         *("--env-kwargs", "distractor:'video'", "action_repeat:50", "--eval-episodes", "1", "-f", str(tmp_path)),
         *("-params", "learning_starts:20", "batch_size:4", "buffer_size:60", "n_envs:2"),
     )

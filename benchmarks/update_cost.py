@@ -8,7 +8,8 @@ observations. `floor` is the full method's matrix products and convolutions alon
 
 BisimSAC and the floor are timed with the actor every 2nd update (`paper`) and every update (`sac`), in fp32 and, where the CPU
 has the instructions, in bf16. All arms are interleaved in one process, one thread; peak memory is that of a process per arm.
-sbx needs the extra `bench`; without it the arm is left out. The last line printed is one JSON object.
+sbx needs the extra `bench`; without it the arm is left out. `families_over_full` compares other metrics with that of the full
+method. The last line printed is one JSON object.
 """
 
 import argparse
@@ -27,6 +28,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import gymnasium as gym
 import numpy as np
 import torch as th
+from _aggregate import FULL as FULL_METHOD
+from _figures import FIGURES, Method
 from _machine import machine
 from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -36,6 +39,7 @@ from torch.nn import functional as F
 from tqdm import tqdm
 
 from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer, IntrinsicRewardVecEnv
+from sb3_robust_bisim.cli.zoo_config import DEFAULT_CONFIG, variant_settings
 from sb3_robust_bisim.encoders import MlpEncoder, PixelEncoder
 
 BATCH = {"mlp": 512, "cnn": 128}
@@ -47,6 +51,7 @@ CPU = dict(device="cpu", seed=0)  # as the floor
 OFF = dict(bisim_coef=0.0, norm_constraint=False)
 CARTPOLE = "robust_bisim/SparseCartPole-v0"
 PIXELS = "robust_bisim/cheetah-run-pixels-v0"
+PARTS = ("mlp", "cnn", "families_over_full", "bonus", "learn")
 
 
 class RandomPixels(gym.Env):
@@ -266,22 +271,44 @@ def learn_cost(steps: int) -> dict[str, float]:
     return {"step_ms": 1000 * seconds / steps, "update_ms": 1000 * sum(updates) / steps, "ratio": seconds / sum(updates)}
 
 
+def family_cost(rounds: int, per_round: int) -> dict[str, float]:
+    """
+    Update of each method of the figure `metric` and of each family of the configuration over that of the full method, from
+    flat observations: medians over the rounds, in which all methods follow each other.
+    """
+    methods = {**FIGURES["metric"].methods, **{name: Method((name,)) for name in ("MICo", "SimSR", "RAP", "DeepMDP")}}
+    models = {}
+    for name, method in methods.items():
+        settings = {**variant_settings(DEFAULT_CONFIG, CARTPOLE, *method.variants), **method.params}
+        settings = {**FULL, **SCHEDULE["paper"], **settings, **CPU, "buffer_size": 1000, "learning_starts": 10**9}
+        models[name] = BisimSAC("MlpPolicy", gym.make(CARTPOLE, noise_multiplier=2), **settings).learn(2 * BATCH["mlp"])
+    times: dict[str, list[float]] = {name: [] for name in models}
+    for round_number in tqdm(range(rounds + 1), desc="families", file=sys.stderr):
+        for name, model in models.items():
+            started = time.perf_counter()
+            model.train(per_round, BATCH["mlp"])
+            if round_number > 0:
+                times[name].append(time.perf_counter() - started)
+    return {name: round(float(np.median(np.divide(times[name], times[FULL_METHOD]))), 3) for name in times}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=30, help="timed rounds over all arms, mlp (default: %(default)s)")
-    parser.add_argument("--cnn-rounds", type=int, default=10, help="the same for cnn; 0 leaves it out (default: %(default)s)")
+    parser.add_argument("--cnn-rounds", type=int, default=10, help="the same for cnn (default: %(default)s)")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="what to measure (default: everything)")
     args = parser.parse_args()
     th.set_num_threads(1)
     allocator = {key: value for key, value in os.environ.items() if key.startswith("MALLOC_")}
     result: dict = {"benchmark": "update_cost", **machine(), "allocator": allocator, "batch": BATCH}
-    result["mlp"] = update_times("mlp", args.rounds, per_round=4)
-    if args.cnn_rounds:
-        result["cnn"] = update_times("cnn", args.cnn_rounds, per_round=2)
-    result["bonus"] = {CARTPOLE: bonus_cost(CARTPOLE, 1, 200)}
-    if args.cnn_rounds:
-        result["bonus"][PIXELS] = bonus_cost(PIXELS, 16, 10)
-    result["learn"] = learn_cost(500)
-    print(json.dumps(result))
+    measure: dict[str, Callable[[], object]] = {
+        "mlp": lambda: update_times("mlp", args.rounds, per_round=4),
+        "cnn": lambda: update_times("cnn", args.cnn_rounds, per_round=2),
+        "families_over_full": lambda: family_cost(args.rounds, per_round=4),
+        "bonus": lambda: {CARTPOLE: bonus_cost(CARTPOLE, 1, 200), PIXELS: bonus_cost(PIXELS, 16, 10)},
+        "learn": lambda: learn_cost(500),
+    }
+    print(json.dumps({**result, **{part: measure[part]() for part in args.parts}}))
 
 
 if __name__ == "__main__":

@@ -71,7 +71,7 @@ def column(returns: dict[str, list[float]]) -> dict[str, str]:
     cells = {}
     for method, values in returns.items():
         text = f"{np.mean(values) + 0.0:.0f}" + (f" ± {error(values):.0f}" if len(values) > 1 else "")
-        near = np.mean(values) + error(values) >= np.mean(returns[best])
+        near = len(returns) > 1 and np.mean(values) + error(values) >= np.mean(returns[best])
         cells[method] = (f"**{text}**" if near else text) + f" ({len(values)})"
     return cells
 

@@ -34,12 +34,6 @@ def check_arguments(model: Any) -> None:
     _require(_is_number(model.gamma) and 0 <= model.gamma <= 1, model, "gamma", "in [0, 1]")
     _require(_is_number(model.tau) and 0 <= model.tau <= 1, model, "tau", "in [0, 1]")
     _check_train_freq(model)
-    if model.buffer_size < model.batch_size:
-        warnings.warn(
-            f"buffer_size={model.buffer_size} is below batch_size={model.batch_size}: every batch repeats transitions. Raise "
-            "buffer_size or lower batch_size.",
-            stacklevel=4,
-        )
     if model.bf16 and model.device.type == "cpu" and not getattr(th.ops.mkldnn, "_is_mkldnn_bf16_supported", bool)():
         warnings.warn("bf16=True: this CPU has no bfloat16 instructions, so fp32 is several times faster.", stacklevel=4)
     _check_random_shift(model.random_shift, model.observation_space)

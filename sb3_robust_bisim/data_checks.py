@@ -45,6 +45,12 @@ class DataChecks(BaseCallback):
                 "nothing is trained. Lower learning_starts or raise total_timesteps.",
                 stacklevel=2,
             )
+        if model.buffer_size < model.batch_size:
+            warnings.warn(
+                f"buffer_size={model.buffer_size} is below batch_size={model.batch_size}: every batch repeats transitions. "
+                "Raise buffer_size or lower batch_size.",
+                stacklevel=2,
+            )
         normalize = model.get_vec_normalize_env()
         self._check("observation", model._last_obs if normalize is None else model._last_original_obs, ENVIRONMENT)
 

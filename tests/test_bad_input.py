@@ -1,6 +1,7 @@
 """BisimSAC refuses bad input before any work starts. Each message names the argument and its value."""
 
 import re
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -122,9 +123,12 @@ def test_episodes_of_several_environments_do_not_end_together() -> None:
     make_model(train_freq=(1, "episode"))
 
 
-def test_a_buffer_below_the_batch_is_told() -> None:
+def test_a_buffer_below_the_batch_is_told_when_training_starts() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model = make_model(buffer_size=7)  # as agents are loaded that only play
     with pytest.warns(UserWarning, match="buffer_size=7 is below batch_size=8: every batch repeats transitions. Raise"):
-        make_model(buffer_size=7)
+        model.learn(1)
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from safetensors.torch import load, save
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
+from stable_baselines3.common.utils import ConstantSchedule
 from torch import nn, optim
 
 from sb3_robust_bisim.encoders import CombinedEncoder, MlpEncoder, PixelEncoder
@@ -125,6 +126,8 @@ def _to_json(name: str, value: Any) -> Any:
     if name in KNOWN_CLASSES and isinstance(value, type):
         known = (known for known, cls in KNOWN_CLASSES[name].items() if cls is value)
         return next(known, f"{value.__module__}.{value.__qualname__}")
+    if type(value) is ConstantSchedule:  # what rl-zoo3 makes of a learning rate
+        value = value.val
     try:
         return _plain(value)
     except TypeError:
@@ -236,7 +239,7 @@ def fill(targets: dict[str, th.Tensor], weights: dict[str, th.Tensor], file: Pat
     """
     Copy weights, after all of them have been checked.
 
-    :raises ValueError: for a tensor that is missing, unknown, of another shape or type, or not finite
+    :raises ValueError: for a tensor that is missing, unknown, of another shape or type, or not finite. float16 fits float32
     """
     remedy = f"{CONFIG} describes another agent, or another version of the library. Export the agent with this version."
     for what, names in (("missing", targets.keys() - weights.keys()), ("unknown", weights.keys() - targets.keys())):
@@ -244,6 +247,8 @@ def fill(targets: dict[str, th.Tensor], weights: dict[str, th.Tensor], file: Pat
             raise ValueError(f"{file}: {len(names)} {what} tensors, such as {min(names)}. {remedy}")
     for name, target in targets.items():
         (shape, dtype), wanted = (tuple(weights[name].shape), weights[name].dtype), (tuple(target.shape), target.dtype)
+        if dtype == th.float16 and target.dtype == th.float32:  # of a compact export
+            dtype = th.float32
         if (shape, dtype) != wanted:
             raise ValueError(f"{file}: {name} has shape {shape} and {dtype}, where {wanted[0]} and {wanted[1]} fit. {remedy}")
     require_finite(weights, str(file))

@@ -15,6 +15,7 @@ from sb3_robust_bisim.bisim_sac import BisimSAC
 from sb3_robust_bisim.checks import check_names
 
 LOG_ENT_COEF = "log_ent_coef"
+TARGET = "critic_target."
 # Arguments about one process or one machine, and those that have a place of their own in the file
 ELSEWHERE = {"policy", "env", "device", "seed", "verbose", "tensorboard_log", "stats_window_size", "_init_setup_model"}
 SETTINGS = [
@@ -25,7 +26,7 @@ SETTINGS = [
 ]
 
 
-def export_agent(model: BisimSAC, folder: str | Path) -> None:
+def export_agent(model: BisimSAC, folder: str | Path, compact: bool = False) -> None:
     """
     Write an agent to ``weights.safetensors`` and ``config.json``. Reading them runs no code, so strangers can exchange them.
 
@@ -35,6 +36,8 @@ def export_agent(model: BisimSAC, folder: str | Path) -> None:
 
     :param model: the agent
     :param folder: is created if it does not exist. Both files are replaced if they exist
+    :param compact: less than half of the size. Weights are float16, so actions differ from the third digit on. The target
+        networks are left out and start as copies
     :raises TypeError: for a subclass of BisimSAC, which may have settings of its own
     :raises ValueError: for a space other than Box, Discrete or Dict of these, or weights that are not finite
     """
@@ -70,6 +73,8 @@ def export_agent(model: BisimSAC, folder: str | Path) -> None:
     }
     weights = _weights_of(model)
     agent_files.require_finite(weights, "model")
+    if compact:
+        weights = {name: _half(name, tensor) for name, tensor in weights.items() if not name.startswith(TARGET)}
     agent_files.write(Path(folder), config, weights)
 
 
@@ -119,7 +124,12 @@ def load_agent(
     if "ent_coef" in kwargs:  # then the exported coefficient does not count
         weights.pop(LOG_ENT_COEF, None)
         targets.pop(LOG_ENT_COEF, None)
+    compact = not any(name.startswith(TARGET) for name in weights)
+    if compact:
+        targets = {name: tensor for name, tensor in targets.items() if not name.startswith(TARGET)}
     agent_files.fill(targets, weights, folder / agent_files.WEIGHTS)
+    if compact:
+        model.critic_target.load_state_dict(model.critic.state_dict())
     if model.use_sde:
         model.policy.reset_noise()  # it was drawn with the weights from before
     model.num_timesteps, model._n_updates = config["num_timesteps"], config["n_updates"]
@@ -145,3 +155,13 @@ def _settings(config: dict[str, Any], kwargs: dict[str, Any], file: Path) -> dic
 def _weights_of(model: BisimSAC) -> dict[str, th.Tensor]:
     weights = agent_files.weights_of(model.policy)
     return weights if model.log_ent_coef is None else {**weights, LOG_ENT_COEF: model.log_ent_coef}
+
+
+def _half(name: str, tensor: th.Tensor) -> th.Tensor:
+    """:raises ValueError: if a number is too large for float16"""
+    if tensor.dtype != th.float32:
+        return tensor
+    half = tensor.detach().half()
+    if not bool(half.isfinite().all()):
+        raise ValueError(f"compact=True: {name} has values above 65504, the largest float16. Export with compact=False.")
+    return half

@@ -1,6 +1,8 @@
-"""`robust-bisim evaluate`, run as a user runs it."""
+"""`robust-bisim evaluate` and `robust-bisim enjoy --video`, run as a user runs them."""
 
 import csv
+import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +10,7 @@ import gymnasium as gym
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+from PIL import Image
 
 from sb3_robust_bisim import BisimSAC
 from sb3_robust_bisim.cli.distractors import Noise, Scene, distractors_of
@@ -127,6 +130,76 @@ def test_a_pixel_agent_gets_a_table_a_picture_and_videos_and_rows_are_not_played
     main([*command, "--distractors", "noise", "--no-video", "--seed", "1"])  # other settings
     assert "1234.5" not in (tmp_path / "evaluation.md").read_text()
     assert "1234.5" in (tmp_path / "evaluation.csv").read_text()
+
+
+def seconds_of_gif(path: Path) -> float:
+    with Image.open(path) as gif:
+        durations = []
+        for i in range(gif.n_frames):
+            gif.seek(i)
+            durations.append(gif.info["duration"])
+    return sum(durations) / 1000
+
+
+def test_enjoy_writes_a_video_of_one_episode_of_a_state_agent(
+    logs: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    enjoy = ["enjoy", "--env", CARTPOLE, "-f", logs, "--seed", "5", "--video"]
+    for name in ("agent.gif", "new/agent.mp4"):
+        main([*enjoy, str(tmp_path / name)])
+    said = capsys.readouterr().out
+    (returned,) = returns_by_hand(logs, 5, 1, noise_multiplier=1, theta_rew_fraction=0.5)
+    assert f"return {returned:.2f}" in said
+    video = imageio.get_reader(tmp_path / "new" / "agent.mp4")
+    n_steps = video.count_frames()
+    assert f"Episode: {n_steps} steps" in said
+    assert video.get_meta_data()["fps"] == 50.0
+    assert video.get_data(n_steps - 1).shape == (400, 600, 3)
+    with Image.open(tmp_path / "agent.gif") as gif:
+        assert gif.size == (600, 400)
+        first = np.asarray(gif.convert("RGB"), dtype=float)
+    assert np.abs(first - video.get_data(0)).mean() < 5  # the same picture
+    assert seconds_of_gif(tmp_path / "agent.gif") == pytest.approx(n_steps / 50)
+    assert not list(tmp_path.rglob(".*"))  # no temporary file is left
+
+
+def test_enjoy_writes_a_video_of_a_pixel_agent_in_front_of_its_background(pixel_logs: str, tmp_path: Path) -> None:
+    enjoy = ["enjoy", "--env", PIXELS, "-f", pixel_logs, "--video"]
+    main([*enjoy, str(tmp_path / "noise.mp4")])
+    main([*enjoy, str(tmp_path / "clean.gif"), "--env-kwargs", "distractor:'none'"])
+    noise = imageio.get_reader(tmp_path / "noise.mp4")
+    assert noise.count_frames() == 10
+    with Image.open(tmp_path / "clean.gif") as gif:
+        assert noise.get_data(3).std() > np.asarray(gif.convert("RGB")).std()
+    assert seconds_of_gif(tmp_path / "clean.gif") == pytest.approx(10.0)  # 100 control steps of 10 ms per frame
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--video", "agent.avi"], "--video agent.avi: unknown suffix '.avi', use .mp4 or .gif"),
+        (["--video", "folder.gif"], "--video folder.gif: this is a folder"),
+        (["--video", "agent.gif", "-n", "100"], "one episode of the deterministic policy, so it does not take -n 100"),
+        (["--video", "agent.gif", "--seed", "-1"], "--seed -1: must be at least 0"),
+        (["--video", "agent.mp4"], "--video imageio.v2 is missing: pip install sb3_robust_bisim[dmc]"),
+        (["-f", "empty"], "--folder empty: no run of bisim_sac on robust_bisim/SparseCartPole-v0 has an agent. .* --trained"),
+    ],
+)
+def test_enjoy_refuses_before_any_work(
+    arguments: list[str],
+    message: str,
+    logs: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder.gif").mkdir()
+    monkeypatch.setitem(sys.modules, "imageio.v2", None)  # as if it were not installed, which a GIF does not need
+    with pytest.raises(SystemExit):
+        main(["enjoy", "--env", CARTPOLE, *([] if "-f" in arguments else ["-f", logs]), *arguments])
+    assert re.search(message.replace("[", r"\["), capsys.readouterr().err)
+    assert [path.name for path in tmp_path.iterdir()] == ["folder.gif"]
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from sb3_contrib import TQC
 from small_models import dicts, images, make_model, parameters, pendulum
 from stable_baselines3 import PPO
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
 
@@ -205,6 +205,35 @@ def test_what_must_not_be_exported_is_refused(tmp_path: Path) -> None:
         export_agent(
             make_model(env=VecNormalize(DummyVecEnv([pendulum]), norm_reward=False), intrinsic_reward_scale=0.0), tmp_path
         )
+
+
+def test_a_compact_export_is_small_and_almost_the_same(agents: Callable[[str], tuple[Any, Path]], tmp_path: Path) -> None:
+    model, whole_folder = agents("MlpPolicy")
+    export_agent(model, tmp_path, compact=True)
+    assert len(whole(tmp_path)) < len(whole(whole_folder)) / 2
+    loaded: Any = load_agent(tmp_path, pendulum())
+    for name, tensor in weights(model.policy).items():
+        if not name.startswith("critic_target"):
+            th.testing.assert_close(loaded.policy.state_dict()[name], tensor, rtol=1e-3, atol=1e-6)
+    assert_same(weights(loaded.critic_target), weights(loaded.critic))
+    obs = observations(model)
+    expected, _ = model.predict(obs, deterministic=True)
+    np.testing.assert_allclose(loaded.predict(obs, deterministic=True)[0], expected, atol=0.02)
+    encoder = PretrainedEncoder(model.observation_space, tmp_path)
+    assert_same(weights(encoder.encoder.extractor), weights(loaded.policy.critic.features_extractor.extractor))
+    loaded.learn(14, reset_num_timesteps=False)
+    assert loaded._n_updates > 4
+
+    large = make_model()
+    with th.no_grad():
+        large.actor.mu.bias.fill_(1e5)
+    with pytest.raises(ValueError, match=r"compact=True: actor.mu.bias has values above 65504.*compact=False"):
+        export_agent(large, tmp_path, compact=True)
+
+
+def test_a_constant_schedule_is_a_number(tmp_path: Path) -> None:
+    export_agent(make_model(learning_rate=ConstantSchedule(0.01)), tmp_path)  # as rl-zoo3 passes it
+    assert load_agent(tmp_path).learning_rate == 0.01
 
 
 def test_an_environment_with_other_spaces_is_refused(exported: Path) -> None:

@@ -39,7 +39,7 @@ MAY_KNOW: dict[str, set[str]] = {
     "export": {"agent_files", "bisim_sac", "checks"},
     "pretrained_encoder": {"agent_files", "encoders"},
     "callbacks": {"bisim_sac", "encoders", "envs", "frame_buffer", "losses", "theory"},
-    "cli": {"bisim_sac", "callbacks", "checks", "envs", "frame_buffer", "runs"},
+    "cli": {"bisim_sac", "callbacks", "checks", "envs", "export", "frame_buffer", "runs"},
 }
 
 

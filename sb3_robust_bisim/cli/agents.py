@@ -1,5 +1,7 @@
 """Find a trained agent in the folder of its run, and make its environment again."""
 
+import argparse
+import importlib
 import os
 from collections.abc import Mapping
 from copy import deepcopy
@@ -10,10 +12,36 @@ from typing import Any
 import yaml
 from rl_zoo3 import ALGOS, create_test_env, get_saved_hyperparams
 from rl_zoo3.exp_manager import ExperimentManager
-from rl_zoo3.utils import EnvironmentName, get_model_path
+from rl_zoo3.utils import EnvironmentName, StoreDict, get_model_path
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
+
+
+def add_agent_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options that choose an agent and its environment. They have the names of rl-zoo3's ``enjoy``."""
+    parser.add_argument("--env", type=EnvironmentName, required=True, help="task")
+    parser.add_argument("-f", "--folder", default="logs", help="folder with the runs (default: %(default)s)")
+    parser.add_argument(
+        "--exp-id",
+        type=int,
+        default=0,
+        help="number of the run (default: the latest one with a saved agent; -1: no run folder)",
+    )
+    parser.add_argument("--load-best", action="store_true", help="play the best agent of the run, not the last one")
+    parser.add_argument("--load-checkpoint", metavar="N", help="play the agent that was saved after N steps")
+    parser.add_argument("--load-last-checkpoint", action="store_true", help="play the last of these agents")
+    parser.add_argument("--gym-packages", nargs="+", default=[], help="packages to import, which register tasks")
+    parser.add_argument(
+        "--env-kwargs",
+        nargs="+",
+        action=StoreDict,
+        default={},
+        metavar="NAME:VALUE",
+        help="arguments of the environment, merged into those of the training, for example theta_rew_fraction:1.0",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of the environment (default: %(default)s)")
+    parser.add_argument("--device", default="auto", help="device of the networks (default: %(default)s)")
 
 
 @dataclass(frozen=True)
@@ -70,6 +98,18 @@ def latest_run(folder: str, algo: str, env: EnvironmentName) -> int:
     runs = Path(folder, algo).glob(f"{env}_*/*.zip")
     numbers = [suffix for run in runs if (suffix := run.parent.name.removeprefix(f"{env}_")).isdigit()]
     return max(map(int, numbers), default=0)
+
+
+def chosen_agent(args: argparse.Namespace) -> Agent:
+    """
+    :param args: see :func:`add_agent_arguments`, and ``algo``
+    :return: the agent
+    :raises ValueError: see :func:`find_agent`
+    """
+    for package in args.gym_packages:
+        importlib.import_module(package)
+    which = (args.exp_id, args.load_best, args.load_checkpoint, args.load_last_checkpoint)
+    return find_agent(args.folder, args.algo, args.env, *which)
 
 
 def find_agent(

@@ -2,7 +2,6 @@
 
 import argparse
 import hashlib
-import importlib
 import json
 from contextlib import closing
 from dataclasses import replace
@@ -11,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from rl_zoo3 import ALGOS
-from rl_zoo3.utils import EnvironmentName, StoreDict
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.utils import set_random_seed
@@ -19,7 +17,7 @@ from tqdm import tqdm
 
 from sb3_robust_bisim.bisim_sac import BisimSAC
 from sb3_robust_bisim.callbacks import DenoisingFactorCallback
-from sb3_robust_bisim.cli.agents import Agent, find_agent
+from sb3_robust_bisim.cli.agents import Agent, add_agent_arguments, chosen_agent
 from sb3_robust_bisim.cli.distractors import Distractors, distractors_of
 from sb3_robust_bisim.cli.record import record_or_explain
 from sb3_robust_bisim.cli.scores import NAN, Score, draw, markdown, read_scores, write_scores
@@ -35,26 +33,7 @@ DESCRIPTION = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command to those that all commands have."""
-    parser.add_argument("--env", type=EnvironmentName, required=True, help="task")
-    parser.add_argument("-f", "--folder", default="logs", help="folder with the runs (default: %(default)s)")
-    parser.add_argument(
-        "--exp-id",
-        type=int,
-        default=0,
-        help="number of the run (default: the latest one with a saved agent; -1: no run folder)",
-    )
-    parser.add_argument("--load-best", action="store_true", help="play the best agent of the run, not the last one")
-    parser.add_argument("--load-checkpoint", metavar="N", help="play the agent that was saved after N steps")
-    parser.add_argument("--load-last-checkpoint", action="store_true", help="play the last of these agents")
-    parser.add_argument("--gym-packages", nargs="+", default=[], help="packages to import, which register tasks")
-    parser.add_argument(
-        "--env-kwargs",
-        nargs="+",
-        action=StoreDict,
-        default={},
-        metavar="NAME:VALUE",
-        help="arguments of the environment, merged into those of the training, for example theta_rew_fraction:1.0",
-    )
+    add_agent_arguments(parser)  # all distractors have the same start states, those of --seed
     parser.add_argument(
         "--distractors",
         nargs="+",
@@ -66,8 +45,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--n-states", type=int, default=125, metavar="N", help="states for the denoising factor (default: %(default)s)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed; all distractors have the same start states")
-    parser.add_argument("--device", default="auto", help="device of the networks (default: %(default)s)")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="folder for the results (default: `evaluation` in the run)")
     parser.add_argument("--no-video", action="store_true", help="record no videos")
 
@@ -90,10 +67,7 @@ def evaluate(args: argparse.Namespace) -> None:
     :param args: see :func:`add_arguments`, and ``algo``
     :raises ValueError: if there is no such agent, or for a distractor that does not exist or does not fit the task
     """
-    for package in args.gym_packages:
-        importlib.import_module(package)
-    which = (args.exp_id, args.load_best, args.load_checkpoint, args.load_last_checkpoint)
-    agent = find_agent(args.folder, args.algo, args.env, *which)
+    agent = chosen_agent(args)
     distractors = distractors_of(agent.env_id, agent.env_kwargs, args.env_kwargs)
     chosen = _chosen(distractors, args.distractors)
     out = args.out or agent.path.parent / "evaluation"

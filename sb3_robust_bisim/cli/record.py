@@ -1,8 +1,11 @@
 """Record an agent: a video of the task and, if it acts from pixels, a contact sheet of its observations."""
 
+import math
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -15,6 +18,22 @@ from sb3_robust_bisim.runs.atomic import atomic_path
 
 COLUMNS, ROWS = 8, 4
 MAX_FRAMES = 1000  # for tasks whose episodes do not end
+GIF_FPS = 50  # browsers slow down faster ones
+
+
+@dataclass
+class Episode:
+    """
+    :param fps: speed of the task in frames per second
+    :param shown: rendered frames, (H, W, 3) bytes each
+    :param seen: the newest frame of each observation, likewise; none if the agent observes no frames
+    :param total_reward: undiscounted return
+    """
+
+    fps: float
+    shown: list[np.ndarray] = field(default_factory=list)
+    seen: list[np.ndarray] = field(default_factory=list)
+    total_reward: float = 0.0
 
 
 def record_or_explain(model: BaseAlgorithm, make_venv: Callable[[], VecEnv], folder: Path) -> str:
@@ -25,9 +44,9 @@ def record_or_explain(model: BaseAlgorithm, make_venv: Callable[[], VecEnv], fol
     :return: the paths of the files, or the reason why there are none: a missing package, or no OpenGL
     """
     try:
-        import imageio.v2  # noqa: F401
+        _imageio()
     except ImportError as error:
-        return f"not recorded, {error.name} is missing: pip install sb3_robust_bisim[dmc]"
+        return f"not recorded, {error}"
     try:
         venv = make_venv()
     except RuntimeError as error:
@@ -38,37 +57,86 @@ def record_or_explain(model: BaseAlgorithm, make_venv: Callable[[], VecEnv], fol
 
 def record(model: BaseAlgorithm, venv: VecEnv, folder: Path) -> list[Path]:
     """
-    Record one episode of the deterministic policy.
+    Record one episode.
 
-    :param model: agent for vectors, or for stacks of RGB or grey frames
-    :param venv: one environment with ``render_mode="rgb_array"`` and the wrappers that the agent was trained with
+    :param model: see :func:`play`
+    :param venv: see :func:`play`
     :param folder: receives ``agent.mp4`` and, for frames, ``what_the_agent_sees.png``
     :return: the paths of the files
     :raises ImportError: if a package of the extra ``dmc`` is missing
     """
-    import imageio.v2 as imageio
-
-    from_pixels = is_image_space(venv.observation_space)
-    shown: list[np.ndarray | None] = []
-    seen: list[np.ndarray] = []
-    n_stack = frames_per_observation(venv)
-    done = False
-    obs = venv.reset()
-    while not done and len(shown) < MAX_FRAMES:
-        shown.append(venv.render())
-        if from_pixels:
-            seen.append(_newest_frame(np.asarray(obs)[0], n_stack))
-        action, _ = model.predict(obs, deterministic=True)  # type: ignore[arg-type]
-        obs, _, dones, _ = venv.step(action)
-        done = bool(dones[0])
-    fps = venv.get_attr("metadata")[0].get("render_fps", 25)  # the speed of the task
-    with atomic_path(folder / "agent.mp4") as temporary:
-        imageio.mimwrite(temporary, shown, format="FFMPEG", fps=fps, macro_block_size=2)  # type: ignore[arg-type]
-    if not from_pixels:
+    episode = play(model, venv)
+    write_video(folder / "agent.mp4", episode.shown, episode.fps)
+    if not episode.seen:
         return [folder / "agent.mp4"]
     with atomic_path(folder / "what_the_agent_sees.png") as temporary:
-        Image.fromarray(contact_sheet(seen)).save(temporary)
+        Image.fromarray(contact_sheet(episode.seen)).save(temporary)
     return [folder / "agent.mp4", folder / "what_the_agent_sees.png"]
+
+
+def play(model: BaseAlgorithm, venv: VecEnv) -> Episode:
+    """
+    Play one episode of the deterministic policy, or its first 1000 steps.
+
+    :param model: agent for vectors, or for stacks of RGB or grey frames
+    :param venv: one environment with ``render_mode="rgb_array"`` and the wrappers that the agent was trained with
+    :return: what was shown and seen
+    :raises ValueError: if the task renders no frames
+    """
+    from_pixels = is_image_space(venv.observation_space)
+    n_stack = frames_per_observation(venv)
+    episode = Episode(venv.get_attr("metadata")[0].get("render_fps", 25))
+    done = False
+    obs = venv.reset()
+    while not done and len(episode.shown) < MAX_FRAMES:
+        frame = venv.render()
+        if frame is None:
+            raise ValueError('The task renders no frames: it needs render_mode="rgb_array" in its metadata.')
+        episode.shown.append(frame)
+        if from_pixels:
+            episode.seen.append(_newest_frame(np.asarray(obs)[0], n_stack))
+        action, _ = model.predict(obs, deterministic=True)  # type: ignore[arg-type]
+        obs, rewards, dones, _ = venv.step(action)
+        episode.total_reward += float(rewards[0])
+        done = bool(dones[0])
+    return episode
+
+
+def check_video(path: Path) -> None:
+    """
+    :param path: where :func:`write_video` is going to write
+    :raises ValueError: for another suffix than .mp4 or .gif
+    :raises ImportError: if a package of the extra ``dmc`` is missing, which GIF does not need
+    """
+    if path.suffix not in (".mp4", ".gif"):
+        raise ValueError(f"{path}: unknown suffix {path.suffix!r}, use .mp4 or .gif.")
+    if path.suffix == ".mp4":
+        _imageio()
+
+
+def write_video(path: Path, frames: list[np.ndarray], fps: float) -> None:
+    """
+    :param path: file, see :func:`check_video`
+    :param frames: (H, W, 3) bytes each
+    :param fps: frames per second. A GIF shows at most 50 of them
+    """
+    with atomic_path(path) as temporary:
+        if path.suffix == ".gif":
+            every = math.ceil(fps / GIF_FPS)
+            first, *others = [Image.fromarray(frame) for frame in frames[::every]]
+            hundredths = round(100 * every / fps)  # the unit of GIF
+            first.save(temporary, save_all=True, append_images=others, duration=10 * hundredths, loop=0)
+        else:
+            _imageio().mimwrite(temporary, frames, format="FFMPEG", fps=fps, macro_block_size=2)
+
+
+def _imageio() -> Any:
+    try:
+        import imageio.v2
+        import imageio_ffmpeg  # noqa: F401
+    except ImportError as error:
+        raise ImportError(f"{error.name} is missing: pip install sb3_robust_bisim[dmc]") from error
+    return imageio.v2
 
 
 def contact_sheet(frames: list[np.ndarray]) -> np.ndarray:

@@ -5,7 +5,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,11 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, 
 from rl_zoo3.utils import EnvironmentName
 
 from sb3_robust_bisim.bisim_sac import BisimSAC
-from sb3_robust_bisim.cli.agents import latest_run
+from sb3_robust_bisim.cli.agents import add_agent_arguments, latest_run
+from sb3_robust_bisim.cli.enjoy import record_episode, trained_run, trained_tasks
 from sb3_robust_bisim.cli.evaluate import DESCRIPTION, add_arguments, check_arguments, evaluate
 from sb3_robust_bisim.cli.manager import ALGO, BisimExperimentManager, RunOptions, sample_bisim_sac_params
+from sb3_robust_bisim.cli.record import check_video
 from sb3_robust_bisim.cli.zoo_config import DEFAULT_CONFIG, is_yaml
 
 ALGOS[ALGO] = BisimSAC
@@ -50,8 +52,7 @@ def main(arguments: Sequence[str] | None = None, program: str = "robust-bisim") 
         with _replaced(sys, "argv", [program, *theirs]), _replaced(rl_zoo3.train, "ExperimentManager", manager):
             rl_zoo3.train.train()
     elif command == "enjoy":
-        with _replaced(sys, "argv", [program, *_enjoy_arguments(program, options)]):
-            rl_zoo3.enjoy.enjoy()
+        _enjoy(program, options)
     elif command == "evaluate":
         evaluate(_evaluate_arguments(program, options))
     else:
@@ -114,7 +115,7 @@ def _train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, li
     if ours.new_episodes and ours.checkpoint is None:
         parser.error("--new-episodes: needs --checkpoint FILE.")
     if ours.checkpoint is not None:
-        _check_writable(parser, ours.checkpoint)
+        _check_writable(parser, "--checkpoint", ours.checkpoint)
     config = ours.conf_file or (str(DEFAULT_CONFIG) if ours.algo == ALGO else None)
     if config is not None and is_yaml(config) and not Path(config).is_file():
         parser.error(f"-conf {config}: there is no such file.")
@@ -127,17 +128,60 @@ def _train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, li
     return options, theirs
 
 
-def _enjoy_arguments(program: str, arguments: list[str]) -> list[str]:
-    """Fill in the folder of `train` and the latest run with a saved agent, where rl-zoo3 takes the latest folder."""
+def _enjoy(program: str, arguments: list[str]) -> None:
+    """
+    Play the latest run with a saved agent, where rl-zoo3 takes the latest folder; or an agent that comes with the package.
+    With --video, one episode goes to a file, which rl-zoo3 cannot do.
+    """
     parser = _parser(program)
-    parser.add_argument("-f", "--folder", default="logs", help="folder with the runs (default: %(default)s)")
+    folder = parser.add_mutually_exclusive_group()
+    folder.add_argument("-f", "--folder", default="logs", help="folder with the runs (default: %(default)s)")
+    folder.add_argument("--trained", action="store_true", help="play the trained agent that comes with the package")
     parser.add_argument("--exp-id", type=int, default=0, help="number of the run (default: the latest one with a saved agent)")
     parser.add_argument("--env", type=EnvironmentName, default=None, help="task")
+    parser.add_argument("--video", type=Path, metavar="FILE", help="write one episode to an .mp4 or .gif, without a window")
     ours, theirs = _parse(parser, arguments)
-    if ours.exp_id == 0 and ours.env is not None:
-        ours.exp_id = latest_run(ours.folder, ours.algo, ours.env)
-    env = [] if ours.env is None else ["--env", ours.env.gym_id]
-    return [*theirs, "-f", ours.folder, "--exp-id", str(ours.exp_id), *env]
+    if {"-h", "--help"} & set(arguments):  # rl-zoo3 prints the other half
+        ours = parser.parse_args([])
+    if ours.trained and (ours.algo != ALGO or ours.env is None or ours.env.gym_id not in trained_tasks()):
+        parser.error(f"--trained: the package has agents of {ALGO} for --env {', '.join(trained_tasks())}, and no others.")
+    video = None if ours.video is None else _video_arguments(program, arguments)
+    with trained_run(ALGO, ours.env) if ours.trained else nullcontext(ours.folder) as found:
+        if video is not None:
+            video.folder = found
+            print(record_episode(video))
+            return
+        if ours.exp_id == 0 and ours.env is not None:
+            ours.exp_id = latest_run(found, ours.algo, ours.env)
+            if ours.exp_id == 0 and "rl-trained-agents" not in found:  # rl-zoo3 downloads those
+                parser.error(
+                    f"--folder {found}: no run of {ours.algo} on {ours.env.gym_id} has an agent. Pass the --folder and --algo "
+                    f"of one that has, or train it: robust-bisim train --env {ours.env.gym_id}. --trained plays an agent that "
+                    f"comes with the package, for {', '.join(trained_tasks())}."
+                )
+        env = [] if ours.env is None else ["--env", ours.env.gym_id]
+        with _replaced(sys, "argv", [program, *theirs, "-f", found, "--exp-id", str(ours.exp_id), *env]):
+            rl_zoo3.enjoy.enjoy()
+
+
+def _video_arguments(program: str, arguments: list[str]) -> argparse.Namespace:
+    """Parse the arguments of `enjoy --video`, and stop with a message before any work if no video can be written."""
+    parser = _parser(program, "Write a video of one episode.")
+    add_agent_arguments(parser)
+    parser.add_argument("--trained", action="store_true")
+    parser.add_argument("--video", type=Path)
+    args, others = parser.parse_known_args(arguments)
+    if others:
+        parser.error(f"--video writes one episode of the deterministic policy, so it does not take {' '.join(others)}.")
+    if args.seed < 0:
+        parser.error(f"--seed {args.seed}: must be at least 0.")
+    try:
+        check_video(args.video)
+    except (ValueError, ImportError) as error:
+        parser.error(f"--video {error}")
+    _check_writable(parser, "--video", args.video)
+    _set_threads(args)
+    return args
 
 
 def _evaluate_arguments(program: str, arguments: list[str]) -> argparse.Namespace:
@@ -146,8 +190,7 @@ def _evaluate_arguments(program: str, arguments: list[str]) -> argparse.Namespac
     add_arguments(parser)
     args = parser.parse_args(arguments)
     check_arguments(parser, args)
-    if (n_threads := _n_threads(args)) > 0:
-        th.set_num_threads(n_threads)
+    _set_threads(args)
     return args
 
 
@@ -181,13 +224,19 @@ def _n_threads(args: argparse.Namespace) -> int:
     return -1 if any(name in os.environ for name in SET_BY_THE_USER) else 1
 
 
-def _check_writable(parser: argparse.ArgumentParser, checkpoint: Path) -> None:
-    """Report before training what would otherwise fail at the first checkpoint."""
-    if checkpoint.is_dir():
-        parser.error(f"--checkpoint {checkpoint}: this is a folder; name a file in it.")
+def _set_threads(args: argparse.Namespace) -> None:
+    """For the commands that are not rl-zoo3's."""
+    if (n_threads := _n_threads(args)) > 0:
+        th.set_num_threads(n_threads)
+
+
+def _check_writable(parser: argparse.ArgumentParser, option: str, file: Path) -> None:
+    """Report before any work what would otherwise fail at the end."""
+    if file.is_dir():
+        parser.error(f"{option} {file}: this is a folder; name a file in it.")
     try:
-        checkpoint.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=checkpoint.parent):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=file.parent):
             pass
     except OSError as error:
-        parser.error(f"--checkpoint {checkpoint}: {error.strerror}; name a file in a folder with write access.")
+        parser.error(f"{option} {file}: {error.strerror}; name a file in a folder with write access.")

@@ -94,6 +94,16 @@ def test_a_mujoco_task_that_has_rendered_can_be_saved() -> None:
     copy.close()
 
 
+def test_a_killed_process_of_an_environment_is_named_and_the_others_are_closed() -> None:
+    venv = ResumableSubprocVecEnv([noisy_pendulum, noisy_pendulum], start_method="fork")
+    venv.reset()
+    venv.processes[0].kill()
+    with pytest.raises(RuntimeError, match=r"process has ended \(exit codes \[-9, None\]"):
+        venv.step(np.zeros((2, 1)))
+    venv.close()
+    assert [process.exitcode for process in venv.processes] == [-9, 0]
+
+
 @pytest.mark.parametrize("make", [partial(mujoco_task, "Hopper-v5"), noisy_pendulum])
 def test_environments_in_other_processes_continue_exactly(make: Any) -> None:
     venv = ResumableSubprocVecEnv([make, make], start_method="fork")

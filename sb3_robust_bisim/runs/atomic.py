@@ -15,7 +15,7 @@ def atomic_path(path: str | os.PathLike[str], alone: bool = False) -> Iterator[P
     """
     Yield a temporary path next to ``path``. It is renamed to ``path`` if the block succeeds, and removed otherwise.
 
-    :param path: the file to write; missing parent folders are created
+    :param path: the file to write; missing parent folders are created. An ``OSError`` names it, such as that of a full disk
     :param alone: True if no other process writes this file. The temporary file then always has the same name, so the next
         write replaces the leftover of a killed process
     """
@@ -26,6 +26,9 @@ def atomic_path(path: str | os.PathLike[str], alone: bool = False) -> Iterator[P
     try:
         yield temporary
         os.replace(temporary, target)
+    except OSError as error:
+        error.filename = error.filename or str(target)  # that of a full disk has none
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

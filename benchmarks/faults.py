@@ -471,13 +471,9 @@ def killed_worker(folder: Path, args: argparse.Namespace) -> Measured:
     alone, *_ = left_alone(folder, *more)
     process = forked(folder / "log.txt", command_line, arguments(folder, *more))
     wait_until((folder / "run.pkl").exists, "the first checkpoint", process)
-    workers = [
-        child for child in psutil.Process(process.pid).children(recursive=True) if child.num_threads() and is_worker(child)
-    ]
-    check(
-        len(workers) >= 3, f"{len(workers)} workers"
-    )  # two of training, one of evaluation; the server that forks them is no worker
-    workers[0].kill()
+    workers = list(filter(is_worker, psutil.Process(process.pid).children(recursive=True)))
+    check(len(workers) == 3, f"{len(workers)} workers, not two of training and one of evaluation")
+    random.Random(3).choice(workers).kill()
     start = time.monotonic()
     code = ended(process, "the run whose worker was killed")
     seconds = time.monotonic() - start
@@ -508,17 +504,17 @@ def evaluations(folder: Path) -> list[Any]:
 
 
 @contextlib.contextmanager
-def dask_cluster(log: Path, port: int) -> Iterator[subprocess.Popen]:
-    """A scheduler and a worker; the scheduler is given."""
+def dask_cluster(log: Path, port: int) -> Iterator[list[subprocess.Popen]]:
+    """A scheduler and a worker."""
     address = f"127.0.0.1:{port}"
     scheduler = started(log, "-m", "dask", "scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard")
     worker = started(log, "-m", "dask", "worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard")
     with no_survivors(scheduler, worker):
-        yield scheduler
+        yield [scheduler, worker]
 
 
 def lost_scheduler(folder: Path, args: argparse.Namespace) -> Measured:
-    """A Dask scheduler is killed during a sweep: the sweep ends, and the same command goes on when there is one again"""
+    """A Dask scheduler and its worker are killed during a sweep, and come back: the same evaluations as without a cluster"""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -526,19 +522,19 @@ def lost_scheduler(folder: Path, args: argparse.Namespace) -> Measured:
     alone = started(folder / "alone.txt", *sweep_command(folder / "alone"))
     with no_survivors(alone):
         check(alone.wait(LONGEST) == 0, (folder / "alone.txt").read_text()[-2000:])
-    with dask_cluster(folder / "dask.txt", port) as scheduler:
+    with dask_cluster(folder / "dask.txt", port) as cluster:
         sweep = started(folder / "log.txt", *sweep_command(folder, *dask))
         with no_survivors(sweep):
             wait_until(lambda: list(folder.glob("work/*/*/checkpoint.pkl")), "the first checkpoint", sweep)
-            scheduler.kill()
+            for process in cluster:
+                process.kill()
             start = time.monotonic()
             try:
-                code = sweep.wait(120)
+                code = sweep.wait(LONGEST)
             except subprocess.TimeoutExpired:
-                raise Lost("the sweep was still waiting 120 s after its scheduler had been killed") from None
+                raise Lost(f"the sweep was still waiting {LONGEST:.0f} s after its scheduler had been killed") from None
             seconds = time.monotonic() - start
-    check(code != 0, "the sweep ended as if it were complete")
-    message = (folder / "log.txt").read_text().strip().splitlines()[-1]
+    message = (folder / "log.txt").read_text().strip().splitlines()[-1] if code else "none: it has finished the run itself"
     with dask_cluster(folder / "dask.txt", port):
         again = started(folder / "again.txt", *sweep_command(folder, *dask))
         with no_survivors(again):
@@ -546,7 +542,7 @@ def lost_scheduler(folder: Path, args: argparse.Namespace) -> Measured:
     check(evaluations(folder) == evaluations(folder / "alone"), "other evaluations than those of a sweep left alone")
     (log,) = folder.glob("work/*/*/log.txt")
     check(log.read_text().count("Going on from step") == 1, "the run did not go on from its checkpoint")
-    return {"tried": 1, "survived": 1, "seconds_until_the_error": round(seconds, 1), "message": message}
+    return {"tried": 1, "survived": 1, "seconds_until_the_sweep_ended": round(seconds, 1), "message": message}
 
 
 def signals(folder: Path, args: argparse.Namespace) -> Measured:

@@ -1,5 +1,6 @@
 """Files that are written completely or not at all."""
 
+import errno
 import io
 import os
 import uuid
@@ -7,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+_WITHOUT_NAME = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # what Python's write() raises without a file name
 PathOrStream = str | Path | io.BufferedIOBase
 
 
@@ -27,7 +29,8 @@ def atomic_path(path: str | os.PathLike[str], alone: bool = False) -> Iterator[P
         yield temporary
         os.replace(temporary, target)
     except OSError as error:
-        error.filename = error.filename or str(target)  # that of a full disk has none
+        if error.errno in _WITHOUT_NAME:
+            error.filename = error.filename or str(target)
         raise
     finally:
         temporary.unlink(missing_ok=True)

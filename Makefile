@@ -8,7 +8,7 @@ OPENGL         := libegl1 libgl1 libgl1-mesa-dri libosmesa6
 HAS_OPENGL     := import sys; from ctypes.util import find_library as f; sys.exit(not (f('EGL') or f('OSMesa')))
 INSTALL_OPENGL := test "$$(id -u)" = 0 && apt-get -qq update && apt-get -qq install -y $(OPENGL) >/dev/null
 
-.PHONY: help setup train train-pixels test test-sb3 lint type docs dist clean
+.PHONY: help setup train train-pixels test test-sb3 test-oldest lint type docs licences audit dist clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -50,6 +50,17 @@ test-sb3: setup  ## Stable-Baselines3's own tests of SAC, with BisimSAC in its p
 		OMP_NUM_THREADS=1 PYTHONPATH=../../tests/upstream ../../$(BIN)/python -m pytest -p swap_sac -q -n 2 -k "BisimSAC or sac or her or train_freq" \
 		$(foreach test,$(SB3_LEFT_OUT),"--deselect=tests/$(test)") $(SB3_TESTS:%=tests/test_%.py)
 
+OLDEST := build/oldest
+
+# lowest-direct: the lower bounds of setup.cfg, and of their own requirements the newest. torch is the pinned one, because PyPI
+# has its older versions only with CUDA.
+test-oldest:  ## all tests with the oldest versions that setup.cfg allows
+	mkdir -p build && $(PYTHON) -m venv $(OLDEST) && grep '^torch==' constraints.txt >build/torch.txt
+	$(OLDEST)/bin/pip install --quiet -c constraints.txt uv
+	$(OLDEST)/bin/uv pip install --quiet --python $(OLDEST)/bin/python --resolution lowest-direct -c build/torch.txt \
+		$${PIP_FIND_LINKS:+--find-links $$PIP_FIND_LINKS} ".[dmc,plots,theory,sweep,test]"
+	$(OLDEST)/bin/python -m pytest -n 2 --dist loadgroup
+
 lint: setup  ## ruff: style and format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -59,6 +70,13 @@ type: setup  ## mypy: the package is fully typed
 
 docs: setup  ## HTML documentation in docs/_build
 	$(BIN)/python -m sphinx -q -b html docs docs/_build
+
+licences: setup  ## docs/licences.md: the licences of everything that a plain installation brings
+	$(BIN)/python tests/licences.py >docs/licences.md
+
+audit:  ## known vulnerabilities of the pinned versions; asks the network
+	mkdir -p build && $(PYTHON) -m venv build/audit && build/audit/bin/pip install --quiet pip-audit
+	build/audit/bin/pip-audit --disable-pip --no-deps -r constraints.txt
 
 dist: setup  ## sdist and wheel in dist/, checked for upload
 	$(BIN)/pip install --quiet -c constraints.txt -e ".[dist]"

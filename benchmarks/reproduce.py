@@ -14,6 +14,7 @@ import os
 import shlex
 import shutil
 import sys
+import tempfile
 import traceback
 from dataclasses import dataclass, replace
 from functools import cache
@@ -323,6 +324,16 @@ def sweep(todo: list[Run], args: argparse.Namespace, out: Path, done: int) -> li
     return failed
 
 
+def check_writable(option: str, folder: Path) -> None:
+    """Say before the first run what would otherwise be said after it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        sys.exit(f"{option} {folder}: {error.strerror}. Name a folder with write access.")
+
+
 def setting(text: str) -> tuple[str, Any]:
     """``batch_size:128`` or ``distance:l1``"""
     key, colon, value = text.partition(":")
@@ -395,6 +406,8 @@ def main() -> None:
         return
     failed = []
     if todo and not args.only_draw:
+        check_writable("--out", out)
+        check_writable("--work", args.work)
         failed = sweep(todo, args, out, sum(result["steps"] for result in done))
     every = runs_of(name, figure, max(MOST_SEEDS, args.seeds or 0))  # also what earlier sweeps have left
     done = [result for run in every if (result := result_of(run, out)) is not None]

@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import resource
 import signal
 import subprocess
 import sys
@@ -299,6 +300,28 @@ with atomic_path({str(path)!r}, alone=True) as temporary:
     save_checkpoint(path, make_model(**LEARNING))
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pkl"]
     assert read_about(path)["num_timesteps"] == 0
+
+
+def test_a_write_that_finds_no_space_names_the_file_and_leaves_the_old_one(tmp_path: Path) -> None:
+    model = make_model(**LEARNING)
+    writers: dict[str, Callable[[Path], None]] = {
+        "run.pkl": lambda path: save_checkpoint(path, model),
+        "agent.zip": model.save,
+        "buffer.pkl": model.save_replay_buffer,
+    }
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for name, write in writers.items():
+        path = tmp_path / name
+        write(path)
+        old = path.read_bytes()
+        resource.setrlimit(resource.RLIMIT_FSIZE, (len(old) // 2, hard))
+        try:
+            with pytest.raises(OSError, match=name):
+                write(path)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert path.read_bytes() == old
+    assert sorted(path.name for path in tmp_path.iterdir() if "previous" not in path.name) == sorted(writers)
 
 
 def test_two_writers_of_one_file_do_not_mix(tmp_path: Path) -> None:

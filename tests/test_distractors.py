@@ -20,7 +20,7 @@ from sb3_robust_bisim.envs.distractors import (
     NoiseDistractor,
     make_distractor,
 )
-from sb3_robust_bisim.envs.video import cache_folder, load_clip, split_clips
+from sb3_robust_bisim.envs.video import _decode, cache_folder, load_clip, split_clips
 
 SIZE = 16
 MOVING = tuple(name for name in DISTRACTORS if name != "none")
@@ -117,6 +117,11 @@ def test_a_grey_clip_keeps_the_brightness(tmp_path: Path) -> None:
 @pytest.mark.parametrize("size", [1, 83, 100])
 def test_a_clip_can_have_any_size(tmp_path: Path, size: int) -> None:
     assert load_clip(flag_clip(tmp_path / "flag.mkv", 33, 47), size).shape == (1, size, size, 3)
+
+
+def test_a_full_disk_is_not_blamed_on_the_clip(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="no space left for a decoded clip; SB3_ROBUST_BISIM_CACHE names another folder"):
+        _decode(flag_clip(tmp_path / "flag.mkv"), Path("/dev/full"), SIZE, "rgb24")
 
 
 def test_decoded_frames_cannot_be_written_to(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_robust_bisim.runs import ResumableSubprocVecEnv
-from sb3_robust_bisim.runs.pickling import NotSaveable, check_environments, dumps
+from sb3_robust_bisim.runs.pickling import NotSaveable, WorkerEnded, check_environments, dumps
 
 LIMIT = 60  # steps per episode
 
@@ -92,6 +92,17 @@ def test_a_mujoco_task_that_has_rendered_can_be_saved() -> None:
     np.testing.assert_array_equal(copy.render(), frame)
     env.close()
     copy.close()
+
+
+def test_a_killed_process_of_an_environment_is_named_and_the_others_are_closed() -> None:
+    venv = ResumableSubprocVecEnv([noisy_pendulum, noisy_pendulum], start_method="fork")
+    venv.reset()
+    venv.processes[0].kill()
+    for use in (lambda: venv.step(np.zeros((2, 1))), venv.reset, lambda: check_environments(venv)):
+        with pytest.raises(WorkerEnded, match=r"process has ended \(exit codes \[-9, None\]"):
+            use()
+    venv.close()
+    assert [process.exitcode for process in venv.processes] == [-9, 0]
 
 
 @pytest.mark.parametrize("make", [partial(mujoco_task, "Hopper-v5"), noisy_pendulum])

@@ -195,6 +195,16 @@ def test_a_run_that_broke_off_does_not_hide_the_other_runs(tmp_path) -> None:
     assert "Broke off" in (folder / "table.md").read_text()
 
 
+def test_a_folder_that_cannot_be_written_is_named_before_the_first_run(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    from reproduce import check_writable
+
+    check_writable("--out", tmp_path / "new")
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit, match=r"--out .*file/results: Not a directory\. Name a folder"):
+        check_writable("--out", tmp_path / "file" / "results")
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [

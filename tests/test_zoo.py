@@ -2,6 +2,7 @@
 
 import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +14,9 @@ import pytest
 import rl_zoo3.enjoy
 import rl_zoo3.train
 import yaml
+from filelock import FileLock
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer
 from sb3_robust_bisim.cli.manager import sample_bisim_sac_params
@@ -261,6 +264,38 @@ def test_a_run_that_was_stopped_says_so(zoo: Zoo, tmp_path: Path) -> None:
     config.write_text(yaml.dump(content))
     output = zoo("train", "--env", CARTPOLE, "-conf", str(config), "-f", str(tmp_path), "--seed", "0", *SHORT)
     assert re.search(r"Stopped at step \d\d of 120\.", output)
+
+
+class Terminated(BaseCallback):
+    """Sends this process SIGTERM at step 60."""
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == 60:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return True
+
+
+def test_sigterm_ends_training_with_a_saved_agent(zoo: Zoo, tmp_path: Path) -> None:
+    content = yaml.safe_load(CONFIG.read_text())
+    content[CARTPOLE]["callback"] = [f"{__name__}.Terminated"]
+    config = tmp_path / "terminated.yml"
+    config.write_text(yaml.dump(content))
+    before = signal.getsignal(signal.SIGTERM)
+    output = zoo("train", "--env", CARTPOLE, "-conf", str(config), "-f", str(tmp_path), "--seed", "0", *SHORT)
+    assert "Stopped at step 60 of 120." in output
+    path = re.search(r"^Model: +(\S+)$", output, re.MULTILINE)
+    assert path is not None
+    assert BisimSAC.load(path[1]).num_timesteps == 60
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_a_checkpoint_that_another_process_writes_is_refused(zoo: Zoo, tmp_path: Path) -> None:
+    checkpoint = tmp_path / "run.pkl"
+    arguments = ("train", "--env", CARTPOLE, "--checkpoint", str(checkpoint), "-f", str(tmp_path / "logs"), *SHORT)
+    with FileLock(tmp_path / ".run.pkl.lock"), pytest.raises(SystemExit, match=r"run\.pkl: another process is writing it"):
+        zoo(*arguments)
+    assert not (tmp_path / "logs").exists()
+    assert "Model:          " in zoo(*arguments)
 
 
 def test_a_missing_config_file_is_named(zoo: Zoo) -> None:

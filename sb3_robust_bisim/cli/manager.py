@@ -148,12 +148,12 @@ class BisimExperimentManager(ExperimentManager):
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         checkpoint = self.options.checkpoint
+        if self.vec_env_class is SubprocVecEnv:  # ours can be saved, and closed after its workers have ended
+            self.vec_env_class = ResumableSubprocVecEnv
         if checkpoint is None:
             return super().setup_experiment()
         if self.optimize_hyperparameters:
             raise ValueError("--checkpoint with -optimize: not supported. Optuna saves its trials itself, see --storage.")
-        if self.vec_env_class is SubprocVecEnv:
-            self.vec_env_class = ResumableSubprocVecEnv
         if checkpoint.is_file():
             return self._continue(checkpoint)
         return self._begin(checkpoint)

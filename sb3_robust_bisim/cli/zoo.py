@@ -2,8 +2,10 @@
 
 import argparse
 import os
+import signal
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import partial
@@ -13,6 +15,7 @@ from typing import Any
 import rl_zoo3.enjoy
 import rl_zoo3.train
 import torch as th
+from filelock import FileLock, Timeout
 from rl_zoo3 import ALGOS
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, convert_offpolicy_params
 from rl_zoo3.utils import EnvironmentName
@@ -49,7 +52,12 @@ def main(arguments: Sequence[str] | None = None, program: str = "robust-bisim") 
     if command == "train":
         ours, theirs = _train_arguments(program, options)
         manager = partial(BisimExperimentManager, ours)
-        with _replaced(sys, "argv", [program, *theirs]), _replaced(rl_zoo3.train, "ExperimentManager", manager):
+        with (
+            _replaced(sys, "argv", [program, *theirs]),
+            _replaced(rl_zoo3.train, "ExperimentManager", manager),
+            _only_run(program, ours.checkpoint),
+            _sigterm_as_ctrl_c(),
+        ):
             rl_zoo3.train.train()
     elif command == "enjoy":
         _enjoy(program, options)
@@ -73,6 +81,36 @@ def _replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
         yield
     finally:
         setattr(owner, name, before)
+
+
+@contextmanager
+def _only_run(program: str, checkpoint: Path | None) -> Iterator[None]:
+    """Refuse a checkpoint that another process is writing: two runs would mix in the checkpoint and in the run's folder."""
+    if checkpoint is None:
+        yield
+        return
+    lock = FileLock(checkpoint.with_name(f".{checkpoint.name}.lock"))
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        sys.exit(f"{program}: --checkpoint {checkpoint}: another process is writing it. Wait for it, or name another file.")
+    try:
+        yield
+    finally:
+        lock.release()  # a killed process releases it, too
+
+
+@contextmanager
+def _sigterm_as_ctrl_c() -> Iterator[None]:
+    """Let SIGTERM, which batch systems send before they kill, end training as Ctrl-C does: with a saved agent."""
+    if threading.current_thread() is not threading.main_thread():  # as in a worker of Dask; only main threads get signals
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
 
 
 def _train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, list[str]]:

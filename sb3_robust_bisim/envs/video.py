@@ -1,5 +1,6 @@
 """Clips for backgrounds: find them, split them into training and held-out clips, and decode them once for all processes."""
 
+import errno
 import glob
 import hashlib
 import importlib.util
@@ -114,6 +115,7 @@ def load_clip(
     :param cache_dir: see :func:`cache_folder`
     :return: read-only uint8 array of shape (frames, size, size, 3), or (frames, size, size) for grayscale
     :raises ValueError: if the file is missing, empty or broken
+    :raises OSError: if the cache cannot be written; the message names the file
     """
     try:
         status = path.stat()
@@ -138,6 +140,7 @@ def _decode(path: Path, target: Path, size: int, pixel_format: str) -> None:
     :param size: height and width of the frames in pixels
     :param pixel_format: ffmpeg's name of the pixel format
     :raises ValueError: if ffmpeg reports an error or finds no frame
+    :raises OSError: if the disk is full
     """
     try:
         from imageio_ffmpeg import get_ffmpeg_exe
@@ -148,6 +151,8 @@ def _decode(path: Path, target: Path, size: int, pixel_format: str) -> None:
     command += ["-pix_fmt", pixel_format, "-f", "rawvideo", "-y", f"file:{target}"]
     result = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
     complaint = result.stderr.strip()
+    if os.strerror(errno.ENOSPC) in complaint:
+        raise OSError(errno.ENOSPC, f"no space left for a decoded clip; {CACHE_VARIABLE} names another folder")
     # For a truncated file, ffmpeg writes some frames and a message, but its return code is 0
     if result.returncode != 0 or complaint or target.stat().st_size == 0:
         reason = complaint.splitlines()[-1] if complaint else "no frame in it"

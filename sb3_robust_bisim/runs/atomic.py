@@ -1,5 +1,6 @@
 """Files that are written completely or not at all."""
 
+import errno
 import io
 import os
 import uuid
@@ -7,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+_WITHOUT_NAME = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # what Python's write() raises without a file name
 PathOrStream = str | Path | io.BufferedIOBase
 
 
@@ -15,7 +17,7 @@ def atomic_path(path: str | os.PathLike[str], alone: bool = False) -> Iterator[P
     """
     Yield a temporary path next to ``path``. It is renamed to ``path`` if the block succeeds, and removed otherwise.
 
-    :param path: the file to write; missing parent folders are created
+    :param path: the file to write; missing parent folders are created. An ``OSError`` names it, such as that of a full disk
     :param alone: True if no other process writes this file. The temporary file then always has the same name, so the next
         write replaces the leftover of a killed process
     """
@@ -26,6 +28,10 @@ def atomic_path(path: str | os.PathLike[str], alone: bool = False) -> Iterator[P
     try:
         yield temporary
         os.replace(temporary, target)
+    except OSError as error:
+        if error.errno in _WITHOUT_NAME:
+            error.filename = error.filename or str(target)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

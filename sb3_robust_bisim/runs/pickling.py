@@ -12,8 +12,10 @@ import io
 import pickle
 import random
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +28,15 @@ from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 
 class NotSaveable(ValueError):
     """An environment cannot be saved. The message names it and the remedy."""
+
+
+class WorkerEnded(RuntimeError):
+    """The process of an environment has ended, such as one that was killed for its memory."""
 
 
 class Pickler(cloudpickle.Pickler):
@@ -69,10 +76,11 @@ def check_environments(env: VecEnv | gym.Env) -> None:
     """
     :param env: an environment with all its wrappers
     :raises NotSaveable: if it cannot be pickled
+    :raises WorkerEnded: if one of its processes has ended
     """
     try:
         dumps(env)
-    except NotSaveable:
+    except (NotSaveable, WorkerEnded):
         raise
     except Exception as error:  # pickling arbitrary objects can raise anything
         raise NotSaveable(
@@ -101,7 +109,7 @@ def restore_generators(states: tuple[Any, ...]) -> None:
 class ResumableSubprocVecEnv(SubprocVecEnv):
     """
     A ``SubprocVecEnv`` that checkpoints can save. Each worker pickles its environment and its random generators. When the
-    checkpoint is loaded, new workers start with them.
+    checkpoint is loaded, new workers start with them. A worker that has ended is an error that says so (``WorkerEnded``).
 
     :param env_fns: functions that create the environments, called in the workers
     :param start_method: how the workers start, as in ``SubprocVecEnv``
@@ -110,6 +118,47 @@ class ResumableSubprocVecEnv(SubprocVecEnv):
     def __init__(self, env_fns: list[Callable[[], gym.Env]], start_method: str | None = None) -> None:
         super().__init__([partial(_resumable, env_fn) for env_fn in env_fns], start_method)
         self.start_method = start_method
+
+    def reset(self) -> VecEnvObs:
+        with self._ended_workers_named():
+            return super().reset()
+
+    def step_async(self, actions: np.ndarray) -> None:
+        with self._ended_workers_named():
+            super().step_async(actions)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        with self._ended_workers_named():
+            return super().step_wait()
+
+    def env_method(self, *args: Any, **kwargs: Any) -> list[Any]:
+        with self._ended_workers_named():
+            return super().env_method(*args, **kwargs)
+
+    @contextmanager
+    def _ended_workers_named(self) -> Iterator[None]:
+        try:
+            yield
+        except (EOFError, ConnectionError) as error:
+            ended = wait([process.sentinel for process in self.processes], timeout=5)
+            for process in self.processes:
+                process.join(5 if process.sentinel in ended else 0)  # the exit code follows a little later
+            codes = [process.exitcode for process in self.processes]
+            raise WorkerEnded(
+                f"An environment's process has ended (exit codes {codes}; None: still running). Training cannot go on. If the "
+                "run has a checkpoint, it continues from there."
+            ) from error
+
+    def close(self) -> None:
+        """End the workers. Those that have ended already, as after Ctrl-C, are left out."""
+        for remote in () if self.closed else self.remotes:
+            with suppress(EOFError, OSError):
+                if self.waiting:
+                    remote.recv()
+                remote.send(("close", None))
+        for process in self.processes:
+            process.join()
+        self.closed = True
 
     def __reduce__(self) -> tuple[Any, ...]:
         workers = self.env_method("pickled")

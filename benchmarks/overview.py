@@ -1,13 +1,14 @@
 """
 One table of all methods on all tasks, from the results of `reproduce.py`: mean last return, standard error and runs.
 
-    python benchmarks/overview.py       # writes docs/overview.md, which the page "Which method should I use?" includes
+    python benchmarks/overview.py       # replaces the table in docs/choosing.md
 
 A result in bold is the best of its task, or within one standard error of the best.
 """
 
 import argparse
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -89,11 +90,12 @@ def table() -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    default = Path(__file__).parents[1] / "docs" / "overview.md"
-    parser.add_argument("--out", type=Path, default=default, help="Markdown file (default: %(default)s)")
+    default = Path(__file__).parents[1] / "docs" / "choosing.md"
+    parser.add_argument("--page", type=Path, default=default, help="Markdown file with the table (default: %(default)s)")
     args = parser.parse_args()
-    with atomic_path(args.out) as temporary:
-        temporary.write_text(table())
+    before, _, after = re.split(r"(?m)((?:^\| method .*\n)(?:^\|.*\n)*)", args.page.read_text(), maxsplit=1)
+    with atomic_path(args.page) as temporary:
+        temporary.write_text(before + table() + after)
 
 
 if __name__ == "__main__":

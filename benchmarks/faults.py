@@ -505,16 +505,17 @@ def evaluations(folder: Path) -> list[Any]:
 
 @contextlib.contextmanager
 def dask_cluster(log: Path, port: int) -> Iterator[list[subprocess.Popen]]:
-    """A scheduler and a worker."""
+    """A scheduler and two workers; with one, joblib would do the runs itself."""
     address = f"127.0.0.1:{port}"
     scheduler = started(log, "-m", "dask", "scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard")
-    worker = started(log, "-m", "dask", "worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard")
-    with no_survivors(scheduler, worker):
-        yield [scheduler, worker]
+    worker = ("-m", "dask", "worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard")
+    processes = [scheduler, *(started(log, *worker) for _ in range(2))]
+    with no_survivors(*processes):
+        yield processes
 
 
 def lost_scheduler(folder: Path, args: argparse.Namespace) -> Measured:
-    """A Dask scheduler and its worker are killed during a sweep, and come back: the same evaluations as without a cluster"""
+    """A Dask scheduler and its workers are killed during a sweep, and come back: the same evaluations as without a cluster"""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -534,7 +535,7 @@ def lost_scheduler(folder: Path, args: argparse.Namespace) -> Measured:
             except subprocess.TimeoutExpired:
                 raise Lost(f"the sweep was still waiting {LONGEST:.0f} s after its scheduler had been killed") from None
             seconds = time.monotonic() - start
-    message = (folder / "log.txt").read_text().strip().splitlines()[-1] if code else "none: it has finished the run itself"
+    message = (folder / "log.txt").read_text().strip().splitlines()[-1] if code else "none"
     with dask_cluster(folder / "dask.txt", port):
         again = started(folder / "again.txt", *sweep_command(folder, *dask))
         with no_survivors(again):

@@ -27,6 +27,7 @@ model = BisimSAC(
     learning_starts=warm_up,
     initial_gradient_steps=warm_up,
     ent_coef="auto_0.01",
+    target_update_interval=2,
     seed=0,
 )
 model.learn(args.steps, progress_bar=True)

@@ -44,7 +44,7 @@ args = parser.parse_args()
 gym.register("Room-v0", Room, max_episode_steps=50)
 model = BisimSAC(
     "MlpPolicy",
-    "Room-v0",
+    gym.make("Room-v0"),
     reward_range=(0, 1),  # of one step
     learning_rate=1e-3,
     learning_starts=args.steps // 10,

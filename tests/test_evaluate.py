@@ -212,7 +212,7 @@ def test_enjoy_refuses_before_any_work(
         (["--env-kwargs", "noise_mean:1"], "--env-kwargs noise_mean:1: --distractors sets it"),
         (["--exp-id", "7"], "--folder .*_7 folder was not found. Pass the --folder"),
         (["--algo", "sac"], "--folder .*No run of sac on .*SparseCartPole-v0 has an agent"),
-        (["--load-best"], "No model found"),
+        (["--load-best"], "--folder .*No run of bisim_sac on .*SparseCartPole-v0 has an agent"),
     ],
 )
 def test_bad_input_is_refused_before_any_work(logs: str, arguments: list[str], message: str, tmp_path: Path) -> None:

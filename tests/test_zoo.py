@@ -113,7 +113,10 @@ def test_train_evaluates_in_the_standard_task_and_reports_and_resumes_and_plays(
     assert (model.intrinsic_reward_scale, model.inverse_dynamics_coef) == (0.0, 0.3)  # still normed-ID, with its -params
     arguments = yaml.unsafe_load((second / "robust_bisim-SparseCartPole-v0" / "args.yml").read_text())
     assert arguments["hyperparams"]["inverse_dynamics_coef"] == 0.3  # so a third run would keep it too
-    (tmp_path / "bisim_sac" / "robust_bisim-SparseCartPole-v0_3").mkdir()  # as left behind by Optuna or a failed run
+    killed = tmp_path / "bisim_sac" / "robust_bisim-SparseCartPole-v0_3"  # it has evaluated, and not ended
+    killed.mkdir()
+    (killed / "best_model.zip").write_bytes(b"")
+    (tmp_path / "bisim_sac" / "robust_bisim-SparseCartPole-v0_4").mkdir()  # as left behind by Optuna or a failed run
     played = zoo("enjoy", "--env", CARTPOLE, "-f", str(tmp_path), "-n", "210", "--no-render")
     assert "SparseCartPole-v0_2/" in played
     assert "Episode Reward" in played

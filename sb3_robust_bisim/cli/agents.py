@@ -88,14 +88,17 @@ class Agent:
         return algorithm.load(self.path, venv, device, custom_objects=unused, verbose=0, **small)
 
 
-def latest_run(folder: str, algo: str, env: EnvironmentName) -> int:
+def latest_run(folder: str, algo: str, env: EnvironmentName, load_best: bool = False, load_checkpoint: bool = False) -> int:
     """
     :param folder: folder with the runs
     :param algo: name of the algorithm
     :param env: task
-    :return: number of the latest run with a saved agent; 0 if there is none. rl-zoo3 takes the latest folder
+    :param load_best: the best agent is wanted, not the last one
+    :param load_checkpoint: one that was saved during training is wanted
+    :return: number of the latest run with such an agent; 0 if there is none. rl-zoo3 takes the latest folder
     """
-    runs = Path(folder, algo).glob(f"{env}_*/*.zip")
+    name = "best_model" if load_best else "rl_model_*_steps" if load_checkpoint else env
+    runs = Path(folder, algo).glob(f"{env}_*/{name}.zip")
     numbers = [suffix for run in runs if (suffix := run.parent.name.removeprefix(f"{env}_")).isdigit()]
     return max(map(int, numbers), default=0)
 
@@ -134,7 +137,7 @@ def find_agent(
     :return: the agent
     :raises ValueError: if there is no such agent
     """
-    exp_id = exp_id or latest_run(folder, algo, env)
+    exp_id = exp_id or latest_run(folder, algo, env, load_best, load_last_checkpoint or load_checkpoint is not None)
     try:
         if exp_id == 0:
             raise ValueError(f"No run of {algo} on {env.gym_id} has an agent")

@@ -190,7 +190,8 @@ def _enjoy(program: str, arguments: list[str]) -> None:
             print(record_episode(video))
             return
         if ours.exp_id == 0 and ours.env is not None:
-            ours.exp_id = latest_run(found, ours.algo, ours.env)
+            from_training = any(argument.startswith(("--load-checkpoint", "--load-last-checkpoint")) for argument in arguments)
+            ours.exp_id = latest_run(found, ours.algo, ours.env, "--load-best" in arguments, from_training)
             if ours.exp_id == 0 and "rl-trained-agents" not in found:  # rl-zoo3 downloads those
                 parser.error(
                     f"--folder {found}: no run of {ours.algo} on {ours.env.gym_id} has an agent. Pass the --folder and --algo "

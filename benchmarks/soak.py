@@ -56,8 +56,9 @@ def watch(command: list[str], folder: Path, minutes: float) -> list[dict[str, fl
             with tqdm(total=round(60 * minutes), unit="s") as bar:
                 while time.time() < end and process.poll() is None:
                     with inside.oneshot():
-                        memory, files, threads = inside.memory_info().rss / 1e6, inside.num_fds(), inside.num_threads()
-                    samples.append({"time": time.time(), "rss_mb": memory, "open_files": files, "threads": threads})
+                        sample = {"rss_mb": inside.memory_info().rss / 1e6, "cpu_seconds": sum(inside.cpu_times()[:2])}
+                        sample |= {"open_files": inside.num_fds(), "threads": inside.num_threads()}
+                    samples.append({"time": time.time(), **sample})
                     time.sleep(min(5.0, 0.6 * minutes))
                     bar.update(min(bar.total, round(time.time() - end + 60 * minutes)) - bar.n)
         finally:
@@ -79,20 +80,28 @@ def steps_over_time(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.array(times), np.array(steps)
 
 
+def last_over_middle(clock: np.ndarray, steps: np.ndarray) -> float:
+    """Steps per unit of a clock in the last quarter of a run, over those in the middle quarter."""
+    marks = clock[0] + np.array([0.375, 0.625, 0.75, 1.0]) * (clock[-1] - clock[0])
+    middle, _, last = np.diff(np.interp(marks, clock, steps))
+    return round(float(last / middle), 3)
+
+
 def summary(samples: list[dict[str, float]], times: np.ndarray, steps: np.ndarray, filled: int) -> dict[str, Any]:
     """Growth after the buffer has filled, and the speed of the last quarter beside that of the middle one."""
     when = np.array([sample["time"] for sample in samples])
     at, memory = np.interp(when, times, steps), np.array([sample["rss_mb"] for sample in samples])
     later = at > 1.5 * filled
     growth = float(np.polyfit(at[later], memory[later], 1)[0] * 10_000) if later.sum() > 2 else None
-    quarter = np.interp(np.quantile(times, [0.375, 0.625, 0.75, 1.0]), times, steps)
-    seconds = np.diff(np.quantile(times, [0.375, 0.625, 0.75, 1.0]))
-    middle, end = (quarter[1] - quarter[0]) / seconds[0], (quarter[3] - quarter[2]) / seconds[2]
+    cpu_seconds = np.interp(times, when, [sample["cpu_seconds"] for sample in samples])
     return {
         "steps": int(steps[-1]),
         "minutes": round((times[-1] - times[0]) / 60, 1),
+        "cpu_minutes": round((cpu_seconds[-1] - cpu_seconds[0]) / 60, 1),
         "growth_mb_per_10000_steps": None if growth is None else round(growth, 3),
-        "speed_of_middle": round(float(end / middle), 3),
+        "speed_of_middle": last_over_middle(times, steps),
+        # says the same when other programs take turns on the core
+        "speed_of_middle_per_cpu_second": last_over_middle(cpu_seconds, steps),
         **{f"{key}_at_most": max(sample[key] for sample in samples) for key in ("rss_mb", "open_files", "threads")},
     }
 

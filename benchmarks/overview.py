@@ -3,7 +3,7 @@ One table of all methods on all tasks, from the results of `reproduce.py`: mean 
 
     python benchmarks/overview.py       # replaces the table in docs/choosing.md
 
-A result in bold is the best of its task, or within one standard error of the best.
+A result in bold is the best of its task, or would be it with one standard error of its own added.
 """
 
 import argparse
@@ -27,12 +27,13 @@ TASKS: dict[str, tuple[str, str]] = {
     "cheetah-run, state": ("robust_bisim/cheetah-run-v0", "cheetah-run"),
     "swingup, video": ("robust_bisim/cartpole-swingup-pixels-v0", "video"),
 }
-FIGURES_OF_METHODS = ("cartpole", "metric", "mountain_car", "dmc_state", "dmc_pixels")
+FIGURES_OF_METHODS = ("cartpole", "dbc_alt", "metric", "mountain_car", "dmc_state", "dmc_pixels")
 METHODS = {  # in the figures: in the table
     "SAC": "SAC",
     "SAC-shift": "SAC with random shift",
     "DBC": "DBC",
     "DBC-shift": "DBC with random shift",
+    "DBC-alt": "DBC-alt",
     "DBC-normed": "DBC-normed",
     "DBC-IR": "DBC-IR",
     "normed-ID": "normed-ID",
@@ -71,9 +72,11 @@ def column(returns: dict[str, list[float]]) -> dict[str, str]:
     best = max(returns, key=lambda method: np.mean(returns[method]), default="")
     cells = {}
     for method, values in returns.items():
-        text = f"{np.mean(values) + 0.0:.0f}" + (f" ± {error(values):.0f}" if len(values) > 1 else "")
+        text = f"{round(np.mean(values)) + 0}" + (
+            f"\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{error(values):.0f}" if len(values) > 1 else ""
+        )
         near = len(returns) > 1 and np.mean(values) + error(values) >= np.mean(returns[best])
-        cells[method] = (f"**{text}**" if near else text) + f" ({len(values)})"
+        cells[method] = (f"**{text}**" if near else text) + f"\N{NO-BREAK SPACE}({len(values)})"
     return cells
 
 

@@ -4,7 +4,9 @@ A soak: long training with checkpoints, evaluations and many resets; memory, ope
     python benchmarks/soak.py                       # an hour of cartpole, then an hour of pixels with video
     python benchmarks/soak.py pixels --minutes 10
 
-Each run is the command line in a process of its own, looked at from outside. It ends by Ctrl-C and must leave a whole agent.
+Each run is the command line in a process of its own, looked at from outside. It ends by SIGTERM, which acts like Ctrl-C, and
+must leave a whole agent. Speed is also given in steps per unit of CPU work: a fixed product of matrices is timed at every
+look, so that programs which take turns on the cores and share their caches do not count.
 Writes ``TASK.json`` and ``TASK.png`` to --out. The last line printed is one JSON object.
 """
 
@@ -23,6 +25,7 @@ import numpy as np
 import psutil
 from _machine import machine
 from matplotlib.figure import Figure
+from scipy.stats import theilslopes
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tqdm import tqdm
 
@@ -45,10 +48,19 @@ RUNS: dict[str, tuple[int, list[str]]] = {
 }
 
 
+def reference_seconds(matrix: np.ndarray) -> float:
+    """CPU time that a fixed piece of work takes now."""
+    start = time.process_time()
+    for _ in range(4):
+        matrix @ matrix
+    return time.process_time() - start
+
+
 def watch(command: list[str], folder: Path, minutes: float) -> list[dict[str, float]]:
-    """Run a command for some minutes, then interrupt it as Ctrl-C does; what it took every few seconds."""
+    """Run a command for some minutes, then end it; what it took every few seconds."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     samples: list[dict[str, float]] = []
+    matrix = np.random.default_rng(0).standard_normal((600, 600))
     with (folder / "log.txt").open("w") as log:
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
         try:
@@ -58,11 +70,11 @@ def watch(command: list[str], folder: Path, minutes: float) -> list[dict[str, fl
                     with inside.oneshot():
                         sample = {"rss_mb": inside.memory_info().rss / 1e6, "cpu_seconds": sum(inside.cpu_times()[:2])}
                         sample |= {"open_files": inside.num_fds(), "threads": inside.num_threads()}
-                    samples.append({"time": time.time(), **sample})
+                    samples.append({"time": time.time(), **sample, "reference_seconds": reference_seconds(matrix)})
                     time.sleep(min(5.0, 0.6 * minutes))
                     bar.update(min(bar.total, round(time.time() - end + 60 * minutes)) - bar.n)
         finally:
-            process.send_signal(signal.SIGINT)
+            process.send_signal(signal.SIGTERM)
             code = process.wait(timeout=300)
     if code != 0 or len(samples) < 10:
         sys.exit(f"{' '.join(command)} ended with exit status {code}:\n{(folder / 'log.txt').read_text()[-3000:]}")
@@ -80,28 +92,35 @@ def steps_over_time(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.array(times), np.array(steps)
 
 
-def last_over_middle(clock: np.ndarray, steps: np.ndarray) -> float:
+def last_over_middle(clock: np.ndarray, steps: np.ndarray) -> float | None:
     """Steps per unit of a clock in the last quarter of a run, over those in the middle quarter."""
     marks = clock[0] + np.array([0.375, 0.625, 0.75, 1.0]) * (clock[-1] - clock[0])
     middle, _, last = np.diff(np.interp(marks, clock, steps))
-    return round(float(last / middle), 3)
+    return round(float(last / middle), 3) if middle > 0 else None
+
+
+def slopes(steps: np.ndarray, memory: np.ndarray) -> list[float]:
+    """Median of the slopes between all pairs of points, and its 95 % interval, per 10,000 steps."""
+    found = theilslopes(memory, steps)
+    return [round(10_000 * float(slope), 3) for slope in (found.slope, found.low_slope, found.high_slope)]
 
 
 def summary(samples: list[dict[str, float]], times: np.ndarray, steps: np.ndarray, filled: int) -> dict[str, Any]:
-    """Growth after the buffer has filled, and the speed of the last quarter beside that of the middle one."""
+    """Growth in the second half, when the buffer has long been full, and the speed of the last quarter over the middle one."""
     when = np.array([sample["time"] for sample in samples])
     at, memory = np.interp(when, times, steps), np.array([sample["rss_mb"] for sample in samples])
-    later = at > 1.5 * filled
-    growth = float(np.polyfit(at[later], memory[later], 1)[0] * 10_000) if later.sum() > 2 else None
-    cpu_seconds = np.interp(times, when, [sample["cpu_seconds"] for sample in samples])
+    later = at > max(1.5 * filled, at[-1] / 2)
+    # the median of all slopes: writing a checkpoint takes memory for a moment
+    growth = slopes(at[later], memory[later]) if later.sum() > 2 else None
+    cpu = np.array([sample["cpu_seconds"] for sample in samples])
+    work = np.cumsum(np.diff(cpu, prepend=cpu[0]) / [sample["reference_seconds"] for sample in samples])
     return {
         "steps": int(steps[-1]),
-        "minutes": round((times[-1] - times[0]) / 60, 1),
-        "cpu_minutes": round((cpu_seconds[-1] - cpu_seconds[0]) / 60, 1),
-        "growth_mb_per_10000_steps": None if growth is None else round(growth, 3),
-        "speed_of_middle": last_over_middle(times, steps),
-        # says the same when other programs take turns on the core
-        "speed_of_middle_per_cpu_second": last_over_middle(cpu_seconds, steps),
+        "minutes": round((when[-1] - when[0]) / 60, 1),
+        "cpu_minutes": round(cpu[-1] / 60, 1),
+        "growth_mb_per_10000_steps": growth,  # with its 95 % interval
+        "speed_of_middle": last_over_middle(when, at),
+        "speed_of_middle_per_work": last_over_middle(work, at),
         **{f"{key}_at_most": max(sample[key] for sample in samples) for key in ("rss_mb", "open_files", "threads")},
     }
 

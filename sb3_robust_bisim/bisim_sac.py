@@ -50,7 +50,7 @@ class BisimSAC(SAC):
         SAC's ``target_update_interval``
     :param initial_gradient_steps: gradient steps done at once when learning starts (1000 in the published experiments)
     :param random_shift: shift the images of each batch by up to this many pixels (DrQ), s and s' apart; 0 turns it off
-    :param bf16: run the encoder under bfloat16 autocast: faster from pixels on a GPU, or a CPU that has it (see
+    :param bf16: run the encoder under bfloat16 autocast: meant for pixels on a GPU, or on a CPU that has it (see
         docs/performance.md). Heads, models and losses stay in fp32
     :param kwargs: the arguments of :class:`stable_baselines3.SAC`; ``n_steps`` must stay 1. Byte images go to a
         :class:`~sb3_robust_bisim.FrameStackReplayBuffer` unless another ``replay_buffer_class`` is named

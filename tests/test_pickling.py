@@ -12,6 +12,7 @@ from gymnasium.wrappers import RecordEpisodeStatistics
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
+from sb3_robust_bisim.envs.opengl import import_suite
 from sb3_robust_bisim.runs import ResumableSubprocVecEnv
 from sb3_robust_bisim.runs.pickling import NotSaveable, WorkerEnded, check_environments, dumps
 
@@ -85,6 +86,7 @@ def test_a_mujoco_task_continues_exactly(name: str) -> None:
 
 
 def test_a_mujoco_task_that_has_rendered_can_be_saved() -> None:
+    import_suite(rendering=True)  # chooses an OpenGL backend, which Gymnasium's renderer reads
     env = gym.make("HalfCheetah-v5", render_mode="rgb_array", width=32, height=32)
     env.reset(seed=1)
     frame = env.render()

@@ -1,5 +1,7 @@
 """What an installation brings along: its licences, and pins and ranges of versions that agree. Nothing asks the network."""
 
+import subprocess
+import sys
 from importlib.metadata import version
 
 import pytest
@@ -75,3 +77,29 @@ def test_every_requirement_has_a_lower_bound_that_is_not_above_what_is_installed
             continue
         assert any(specifier.operator == ">=" for specifier in requirement.specifier), f"{requirement}: has no lower bound"
         assert requirement.specifier.contains(version(requirement.name), prereleases=True)
+
+
+# Hides what a plain installation does not bring, then imports what the commands import
+PLAIN = """
+import sys
+from importlib.metadata import packages_distributions
+from packaging.utils import canonicalize_name
+
+plain = set(sys.argv[1:])
+hidden = {module for module, names in packages_distributions().items() if not plain & set(map(canonicalize_name, names))}
+
+class Hider:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in hidden:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Hider())
+import rl_zoo3.enjoy, rl_zoo3.train
+import sb3_robust_bisim.cli.zoo
+"""
+
+
+def test_the_commands_import_only_what_a_plain_installation_brings() -> None:
+    plain = [*closure(requirements()), "sb3-robust-bisim"]
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", PLAIN, *plain], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]

@@ -72,11 +72,9 @@ def column(returns: dict[str, list[float]]) -> dict[str, str]:
     best = max(returns, key=lambda method: np.mean(returns[method]), default="")
     cells = {}
     for method, values in returns.items():
-        text = f"{round(np.mean(values)) + 0}" + (
-            f"\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{error(values):.0f}" if len(values) > 1 else ""
-        )
+        text = f"{round(np.mean(values))}" + (f" ± {error(values):.0f}" if len(values) > 1 else "")
         near = len(returns) > 1 and np.mean(values) + error(values) >= np.mean(returns[best])
-        cells[method] = (f"**{text}**" if near else text) + f"\N{NO-BREAK SPACE}({len(values)})"
+        cells[method] = f"{f'**{text}**' if near else text} ({len(values)})".replace(" ", "\N{NO-BREAK SPACE}")
     return cells
 
 

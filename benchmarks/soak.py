@@ -4,9 +4,9 @@ A soak: long training with checkpoints, evaluations and many resets; memory, ope
     python benchmarks/soak.py                       # an hour of cartpole, then an hour of pixels with video
     python benchmarks/soak.py pixels --minutes 10
 
-Each run is the command line in a process of its own, looked at from outside. It ends by SIGTERM, which acts like Ctrl-C, and
-must leave a whole agent. Speed is also given in steps per unit of CPU work: a fixed product of matrices is timed at every
-look, so that programs which take turns on the cores and share their caches do not count.
+Each run is the command line in a process of its own, looked at from outside. It ends by SIGTERM, which acts like Ctrl-C but
+reaches a background process as well, and must leave a whole agent. Speed is also given in steps per unit of CPU work: a fixed
+product of matrices is timed at every look, so that programs which take turns on the cores and share their caches do not count.
 Writes ``TASK.json`` and ``TASK.png`` to --out. The last line printed is one JSON object.
 """
 
@@ -20,6 +20,8 @@ import tempfile
 import time
 from pathlib import Path
 from typing import Any
+
+os.environ["OMP_NUM_THREADS"] = "1"  # here, and in the runs
 
 import numpy as np
 import psutil
@@ -58,19 +60,23 @@ def reference_seconds(matrix: np.ndarray) -> float:
 
 def watch(command: list[str], folder: Path, minutes: float) -> list[dict[str, float]]:
     """Run a command for some minutes, then end it; what it took every few seconds."""
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     samples: list[dict[str, float]] = []
     matrix = np.random.default_rng(0).standard_normal((600, 600))
     with (folder / "log.txt").open("w") as log:
-        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
+        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
         try:
             inside, end = psutil.Process(process.pid), time.time() + 60 * minutes
             with tqdm(total=round(60 * minutes), unit="s") as bar:
                 while time.time() < end and process.poll() is None:
                     with inside.oneshot():
-                        sample = {"rss_mb": inside.memory_info().rss / 1e6, "cpu_seconds": sum(inside.cpu_times()[:2])}
-                        sample |= {"open_files": inside.num_fds(), "threads": inside.num_threads()}
-                    samples.append({"time": time.time(), **sample, "reference_seconds": reference_seconds(matrix)})
+                        sample = {
+                            "time": time.time(),
+                            "rss_mb": inside.memory_info().rss / 1e6,
+                            "cpu_seconds": sum(inside.cpu_times()[:2]),
+                            "open_files": inside.num_fds(),
+                            "threads": inside.num_threads(),
+                        }
+                    samples.append({**sample, "reference_seconds": reference_seconds(matrix)})
                     time.sleep(min(5.0, 0.6 * minutes))
                     bar.update(min(bar.total, round(time.time() - end + 60 * minutes)) - bar.n)
         finally:

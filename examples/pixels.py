@@ -23,7 +23,7 @@ def make_env(n_envs: int, split: str) -> VecEnv:
     return VecFrameStack(make_vec_env(TASK, n_envs, seed=0, env_kwargs=env_kwargs), N_STACK)
 
 
-# Self-prediction: dynamics and reward model shape the encoder. In front of video the metric has not helped yet
+# Self-prediction: dynamics and reward model shape the encoder. In front of video the full method has not helped yet
 model = BisimSAC(
     "CnnPolicy",
     make_env(8, "train"),

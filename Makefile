@@ -26,7 +26,7 @@ train: setup  ## the full method on noisy sparse cartpole (two distractors per s
 	$(BIN)/python -m sb3_robust_bisim train --env robust_bisim/SparseCartPole-v0 --n-timesteps 10000 --seed 0 \
 		--eval-freq 500 --eval-episodes 10 --log-interval 20 --progress --verbose 0 --log-folder logs --tensorboard-log logs/tensorboard
 
-train-pixels: setup  ## ten minutes or more of cartpole-swingup from pixels with video behind it; ends with a video of the agent
+train-pixels: setup  ## six minutes or more of cartpole-swingup from pixels with video behind it; ends with a video of the agent
 	$(BIN)/python -m sb3_robust_bisim train --env robust_bisim/cartpole-swingup-pixels-v0 --variant self-prediction small \
 		--n-timesteps 12000 --seed 0 --eval-freq 4000 --eval-episodes 2 --progress --verbose 0 --log-folder logs \
 		--tensorboard-log logs/tensorboard

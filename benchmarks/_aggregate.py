@@ -2,6 +2,7 @@
 
 import csv
 from collections.abc import Callable, Iterable
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +106,7 @@ QUANTITIES: dict[str, tuple[Callable[[list[Result], str], Curve], str, str, str]
 def styles(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
     """How each method is drawn."""
     names = {method: method.removesuffix(AS_WRITTEN) for method in methods}
-    free = iter([look for name, look in LOOKS.items() if name not in names.values()])
+    free = cycle([look for name, look in LOOKS.items() if name not in names.values()] or LOOKS.values())
     looks = {name: LOOKS.get(name) or next(free) for name in dict.fromkeys(names.values())}
     return {
         method: {"color": looks[name][0], "linestyle": looks[name][1], "linewidth": 2.0 if method == name else 1.0}

@@ -272,8 +272,9 @@ def play(folder: Path, identity: dict, split: str, n_episodes: int = 20) -> list
 
     run, arguments = run_folder(folder)
     kwargs = {**arguments["env_kwargs"], "split": split}
-    venv = VecFrameStack(make_vec_env(identity["env"], 1, seed=10_000, env_kwargs=kwargs), n_stack=3)
+    venv = VecFrameStack(make_vec_env(identity["env"], 1, env_kwargs=kwargs), n_stack=3)
     model = BisimSAC.load(next(run.glob("robust_bisim-*.zip")), env=venv, device="cpu", buffer_size=1)
+    venv.seed(10_000)  # after loading, which sets the seed of the training
     returns, _ = evaluate_policy(model, model.get_env(), n_episodes, return_episode_rewards=True)  # type: ignore[arg-type]
     venv.close()
     return np.round(returns, 3).tolist()

@@ -3,7 +3,8 @@ from typing import Any, Self
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 from stable_baselines3.common.utils import check_for_correct_spaces, polyak_update
 from stable_baselines3.sac.sac import SAC
 from torch.nn import functional as F
@@ -284,6 +285,18 @@ class BisimSAC(SAC):
             return super().learn(
                 total_timesteps, checked(callback), log_interval, tb_log_name, reset_num_timesteps, progress_bar
             )
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        whole = False
+        try:
+            rollout = super().collect_rollouts(*args, **kwargs)
+            whole = rollout.continue_training
+            return rollout
+        finally:
+            if not whole:  # a callback has stopped it before the last step was stored: the next learn() begins new episodes
+                self._last_obs = None
+                if isinstance(self.replay_buffer, HerReplayBuffer):
+                    self.replay_buffer.truncate_last_trajectory()
 
     def save(self, path: PathOrStream, *args: Any, **kwargs: Any) -> None:
         """Like SB3's ``save``; a file that existed before stays whole until the new one is."""

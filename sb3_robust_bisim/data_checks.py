@@ -28,6 +28,8 @@ class DataChecks(BaseCallback):
     SB3's VecCheckNan names neither environment nor step, sees no terminal observation, and as a wrapper it would make the
     chains of training and evaluation differ, which EvalCallback refuses.
 
+    Under VecNormalize, an infinite terminal observation has been clipped before it is seen here.
+
     :raises ValueError: from ``learn()``, for a number that is not finite
     """
 

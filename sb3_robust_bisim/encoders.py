@@ -122,7 +122,7 @@ class PixelEncoder(BaseFeaturesExtractor):
     :param strides: one convolution for each. Larger strides first make it cheaper: (3, 2, 1) costs a third of (2, 1)
     :param layer_norm: normalise the embedding
     :param normalized_image: whether the space holds floats in [0, 1] already, see SB3's NatureCNN
-    :raises ValueError: for a space that does not hold images, or whose images are too small for ``strides``
+    :raises ValueError: for a space without images or with the channels last, or if its images are too small for ``strides``
     """
 
     def __init__(
@@ -140,6 +140,11 @@ class PixelEncoder(BaseFeaturesExtractor):
             )
         super().__init__(observation_space, features_dim)
         channels, *size = observation_space.shape
+        if size[1] < min(channels, size[0]):  # SB3 puts the channels of byte images first, and leaves floats as they are
+            raise ValueError(
+                f"CnnPolicy needs images with the channels first, the observation space is {observation_space}. Transpose "
+                "them, for example with gymnasium.wrappers.TransformObservation."
+            )
         convs: list[nn.Module] = []
         for stride in strides:
             if stride < 1 or min(size) < 3:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch as th
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.sac.sac import SAC
 
@@ -88,7 +89,7 @@ def load_agent(
     training does not continue exactly; :func:`sb3_robust_bisim.runs.save_checkpoint` is for that.
 
     :param folder: with both files. A hostile file may make loading fail or take much memory, but no more than that
-    :param env: environment for further training, or its id; not needed for prediction
+    :param env: environment for further training, or its id; for prediction only an agent with HerReplayBuffer needs it
     :param device: where the nets are
     :param kwargs: arguments of BisimSAC that replace the exported ones, ``policy`` and ``seed`` among them. ``policy_kwargs``
         replace those of the same name; pass your own classes there:
@@ -108,6 +109,8 @@ def load_agent(
         raise ValueError(f"{file}: policy_kwargs is no dict. Get the file again, or export again.")
     spaces = {name: agent_files.space_from_json(config[name], file) for name in ("observation_space", "action_space")}
     settings = _settings(config, kwargs, file)
+    if env is None and issubclass(settings.get("replay_buffer_class") or object, HerReplayBuffer):
+        raise ValueError("env=None: the agent's HerReplayBuffer computes rewards with its environment. Pass env.")
     model = BisimSAC(env=env, device=device, _init_setup_model=False, **settings)  # type: ignore[arg-type]  # as in SB3
     for name, space in spaces.items():
         if env is not None and getattr(model, name) != space:
@@ -119,7 +122,8 @@ def load_agent(
     try:
         model._setup_model()
     except Exception as error:
-        raise ValueError(f"{file}: no agent can be built from this ({error!r}). Export it again.") from error
+        remedy = "Export it again, or check the arguments of load_agent."
+        raise ValueError(f"{file}: no agent can be built from this ({error!r}). {remedy}") from error
     targets = _weights_of(model)
     if "ent_coef" in kwargs:  # then the exported coefficient does not count
         weights.pop(LOG_ENT_COEF, None)

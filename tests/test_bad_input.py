@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import pytest
 import torch as th
+from gymnasium import spaces
 from small_models import SMALL, dicts, images, make_model, pendulum
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
@@ -149,6 +150,17 @@ def test_a_buffer_below_the_batch_is_told_when_training_starts() -> None:
 def test_a_policy_that_does_not_fit_is_refused(policy: Any, env: Callable[[], gym.Env], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_model(policy, env())
+
+
+@pytest.mark.parametrize("n_stack", [1, 3])
+def test_float_images_with_the_channels_last_are_refused(n_stack: int) -> None:
+    class FloatImages(gym.Env):
+        observation_space = spaces.Box(0, 1, (84, 84, 3))
+        action_space = spaces.Box(-1, 1, (1,))
+
+    env = VecFrameStack(DummyVecEnv([FloatImages]), n_stack)
+    with pytest.raises(ValueError, match=r"channels first, the observation space is Box\(.*TransformObservation"):
+        make_model("CnnPolicy", env, policy_kwargs=dict(normalize_images=False))
 
 
 def test_hindsight_replay_with_a_bonus_is_refused() -> None:

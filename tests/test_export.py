@@ -17,7 +17,8 @@ from gymnasium import spaces
 from safetensors.torch import load_file, save_file
 from sb3_contrib import TQC
 from small_models import dicts, images, make_model, parameters, pendulum
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, HerReplayBuffer
+from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -239,6 +240,15 @@ def test_a_constant_schedule_is_a_number(tmp_path: Path) -> None:
 def test_an_environment_with_other_spaces_is_refused(exported: Path) -> None:
     with pytest.raises(ValueError, match=r"env: its observation_space is Box.*needs Box"):
         load_agent(exported, gym.make("MountainCarContinuous-v0"))
+
+
+def test_an_agent_with_hindsight_replay_asks_for_its_environment(tmp_path: Path) -> None:
+    env = BitFlippingEnv(n_bits=4, continuous=True, discrete_obs_space=True)
+    settings: dict[str, Any] = dict(replay_buffer_class=HerReplayBuffer, intrinsic_reward_scale=0.0)
+    export_agent(make_model("MultiInputPolicy", env, **settings), tmp_path)
+    with pytest.raises(ValueError, match=r"^env=None: the agent's HerReplayBuffer .* Pass env\.$"):
+        load_agent(tmp_path)
+    assert isinstance(load_agent(tmp_path, env).replay_buffer, HerReplayBuffer)
 
 
 def test_dicts_keep_the_order_of_their_keys(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """BisimSAC keeps the contract of a Stable-Baselines3 algorithm, with bonus and inverse dynamics switched on."""
 
+from contextlib import nullcontext
 from copy import deepcopy
 from functools import partial
 from itertools import product
@@ -12,11 +13,18 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from small_models import EPISODE, dicts, images, make_model, parameters, pendulum, with_data
-from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize, VecTransposeImage, is_vecenv_wrapped
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecFrameStack,
+    VecNormalize,
+    VecTransposeImage,
+    is_vecenv_wrapped,
+)
 from stable_baselines3.her import HerReplayBuffer
 from torch import nn
 
@@ -200,6 +208,62 @@ def test_sb3s_callbacks_save_checkpoints_and_stop_training(tmp_path: Path) -> No
     assert loaded.num_timesteps == 16
     assert loaded._n_updates == 5
     assert loaded.replay_buffer.size() == 15  # the callback runs before the transition is stored
+
+
+class Counting(gym.Env):
+    """Observes the number of the step, up to 10."""
+
+    observation_space = spaces.Box(0, EPISODE, (1,))
+    action_space = spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.step_number = 0
+        return np.zeros(1, dtype=np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.step_number += 1
+        return np.full(1, self.step_number, dtype=np.float32), 0.0, self.step_number == EPISODE, False, {}
+
+
+class Stop(BaseCallback):
+    def __init__(self, step: int, error: type[BaseException] | None) -> None:
+        super().__init__()
+        self.step, self.error = step, error
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.step and self.error is not None:
+            raise self.error
+        return self.num_timesteps != self.step
+
+
+@pytest.mark.parametrize("error", [None, KeyboardInterrupt])
+@pytest.mark.parametrize("step", [3, EPISODE])
+def test_training_goes_on_in_a_new_episode_after_a_callback_has_stopped_it(step: int, error: Any) -> None:
+    model = make_model(env=Counting())
+    with nullcontext() if error is None else pytest.raises(error):
+        model.learn(100, Stop(step, error))
+    model.learn(20, reset_num_timesteps=False)
+    buffer = model.replay_buffer
+    assert buffer.size() == step - 1 + 20  # the callback runs before the transition is stored
+    np.testing.assert_array_equal(buffer.next_observations[: buffer.pos] - buffer.observations[: buffer.pos], 1)
+
+
+def test_training_from_pixels_goes_on_after_a_callback_has_stopped_it() -> None:
+    model = make_model("CnnPolicy", VecFrameStack(DummyVecEnv([images]), 3))
+    model.learn(100, Stop(13, None)).learn(7, reset_num_timesteps=False)
+    assert model.replay_buffer.size() == 12 + 7
+
+
+def test_hindsight_replay_ends_the_episode_that_a_callback_has_cut_off() -> None:
+    env = BitFlippingEnv(n_bits=4, continuous=True, max_steps=5)
+    model = make_model("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, intrinsic_reward_scale=0.0)
+    with pytest.warns(UserWarning, match="will be truncated"):
+        model.learn(100, Stop(4, None))
+    model.learn(20, reset_num_timesteps=False)
+    buffer = model.replay_buffer
+    assert buffer.dones[2]  # of the transitions 0 to 2, which were stored
+    assert buffer.ep_start[2] + buffer.ep_length[2] == 3
 
 
 class NormDropout(BaseFeaturesExtractor):

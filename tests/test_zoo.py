@@ -301,6 +301,15 @@ def test_a_checkpoint_that_another_process_writes_is_refused(zoo: Zoo, tmp_path:
     assert "Model:          " in zoo(*arguments)
 
 
+@pytest.mark.parametrize("number", ["0", "-1"])
+def test_a_run_without_steps_is_refused(zoo: Zoo, number: str, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit) as stop:
+        zoo("train", "--env", CARTPOLE, "-n", number, "-f", str(tmp_path / "logs"))
+    assert stop.value.code == 2
+    assert f"--n-timesteps {number}: must be at least 1." in zoo.output
+    assert not (tmp_path / "logs").exists()
+
+
 def test_a_missing_config_file_is_named(zoo: Zoo) -> None:
     with pytest.raises(SystemExit) as stop:
         zoo("train", "--env", CARTPOLE, "-conf", "nowhere.yml")
@@ -364,8 +373,8 @@ def test_optuna_samples_nothing_that_the_tuned_method_switches_off() -> None:
     assert not sampled.keys() & {"intrinsic_reward_scale", "inverse_dynamics_coef"}
 
 
-@pytest.mark.parametrize("expression", [False, True])
-def test_a_trial_is_repeated_with_its_own_settings(zoo: Zoo, expression: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("expression", "number"), [(False, 0), (False, 1), (True, 1)])
+def test_a_trial_is_repeated_with_its_own_settings(zoo: Zoo, expression: bool, number: int, tmp_path: Path) -> None:
     storage = f"sqlite:///{tmp_path}/study.db"
     study = optuna.create_study(storage=storage, study_name="pendulum")
     layers = {"features_extractor_kwargs": {"n_layers": 3}}
@@ -374,13 +383,16 @@ def test_a_trial_is_repeated_with_its_own_settings(zoo: Zoo, expression: bool, t
     if expression:  # as in rl-zoo3's own files, which evaluates it
         content[PENDULUM]["variants"]["DBC"]["policy_kwargs"] = "dict(features_extractor_kwargs=dict(n_layers=3))"
     config.write_text(yaml.dump(content))
+    trials = []
     for _ in range(2):
         trial = study.ask()
-        sampled = sample_bisim_sac_params(trial, 1, 1, NO_HER, {"bisim_coef": 0.5, "policy_kwargs": layers})
+        trials.append(sample_bisim_sac_params(trial, 1, 1, NO_HER, {"bisim_coef": 0.5, "policy_kwargs": layers}))
         study.tell(trial, 0.0)
+    sampled = trials[number]
     zoo(
         *("train", "--env", PENDULUM, "--variant", "DBC", "--eval-freq", "-1", "-n", "20", "-f", str(tmp_path)),
-        *("--storage", storage, "--study-name", "pendulum", "--trial-id", "1", "-conf", str(config)),
+        *("--storage", storage, "--study-name", "pendulum", "--trial-id", str(number)),
+        *("-conf", str(config)),
     )
     model = BisimSAC.load(tmp_path / "bisim_sac/robust_bisim-SparsePendulum-v0_1/robust_bisim-SparsePendulum-v0.zip")
     assert model.bisim_coef == sampled["bisim_coef"]  # not the variant's

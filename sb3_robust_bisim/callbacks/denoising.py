@@ -30,8 +30,8 @@ class DenoisingFactorCallback(EnvironmentCallback):
     drawn by :class:`~sb3_robust_bisim.envs.NoiseObservation` and mixed by its projection. In a stack of frames, each frame is
     drawn again.
 
-    On pixel tasks every anchor and every positive has its own distraction: another background, camera pose and colours, drawn
-    by :meth:`~sb3_robust_bisim.envs.pixels.PixelTask.look`. Those of a positive go on from frame to frame of a stack.
+    On pixel tasks the anchors keep the distractions of the walk: background, camera pose and colours. Each episode of the walk
+    draws ``n_positives`` others, which its states share, and which move on from frame to frame as those of the walk do.
 
     ``eval_env_kwargs`` adds ``bisim/denoising_factor_heldout``: the same number for noise or backgrounds that training does
     not use. It is measured in a separate environment with the same start states, where the policy acts on the held-out noise.

@@ -17,9 +17,10 @@ class EmbeddingCallback(DiagnosticCallback):
     Shows the embedding in TensorBoard. The projector shows each state with its value and reward, and with its frame if the
     agent observes pixels. ``embedding/pca`` shows the plane of the two largest principal components, coloured by value.
 
-    The states are sampled from the replay buffer. Their value is min_k Q_k(s, mean action).
+    The states are sampled from the replay buffer, with replacement. Their value is min_k Q_k(s, mean action).
 
-    The arguments are those of :class:`DiagnosticCallback`. If the buffer has fewer than ``n_states`` states, all are shown.
+    The arguments are those of :class:`DiagnosticCallback`. From a buffer with fewer than ``n_states`` states, as many are
+    drawn as it has.
 
     :raises ValueError: also at the start of training if there is no TensorBoard log
 

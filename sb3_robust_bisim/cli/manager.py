@@ -138,7 +138,7 @@ class BisimExperimentManager(ExperimentManager):
 
     def _trial_settings(self, settings: dict[str, Any]) -> dict[str, Any]:
         """The hyperparameters of --trial-id, if given. Its policy_kwargs extend those of the entry and the variants."""
-        if self.algo != ALGO or not (self.storage and self.study_name and self.trial_id):
+        if self.algo != ALGO or not (self.storage and self.study_name and self.trial_id is not None):
             return {}
         if not is_yaml(self.config):
             raise ValueError(f"-conf {self.config}: --trial-id needs a YAML file.")

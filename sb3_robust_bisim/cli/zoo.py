@@ -145,11 +145,16 @@ def _train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, li
         metavar="N",
         help="environment steps between two checkpoints (default: %(default)s)",
     )
+    parser.add_argument(
+        "-n", "--n-timesteps", type=int, help="environment steps of the run, at least 1 (default: as in the config file)"
+    )
     parser.add_argument("--seed", type=int, help="seed of environments, networks and sampling (default: a random one)")
     parser.add_argument("-conf", "--conf-file", help=f"file with hyperparameters (default for {ALGO}: {DEFAULT_CONFIG})")
     ours, theirs = _parse(parser, arguments)
     if ours.checkpoint_freq < 1:
         parser.error(f"--checkpoint-freq {ours.checkpoint_freq}: must be at least 1.")
+    if ours.n_timesteps is not None and ours.n_timesteps < 1:  # rl-zoo3 would take the config file's
+        parser.error(f"--n-timesteps {ours.n_timesteps}: must be at least 1. Without it, the config file's number counts.")
     if ours.new_episodes and ours.checkpoint is None:
         parser.error("--new-episodes: needs --checkpoint FILE.")
     if ours.checkpoint is not None:
@@ -159,8 +164,9 @@ def _train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, li
         parser.error(f"-conf {config}: there is no such file.")
     if config is not None:
         theirs += ["-conf", config]
-    if ours.seed is not None:
-        theirs += ["--seed", str(ours.seed)]
+    for option in ("seed", "n_timesteps"):
+        if (value := getattr(ours, option)) is not None:
+            theirs += [f"--{option.replace('_', '-')}", str(value)]
     seed_given = ours.seed is not None and ours.seed >= 0
     options = RunOptions(tuple(ours.variants), ours.checkpoint, ours.checkpoint_freq, ours.new_episodes, seed_given)
     return options, theirs

@@ -3,8 +3,7 @@ from typing import Any, Self
 
 import numpy as np
 import torch as th
-from stable_baselines3 import HerReplayBuffer
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import check_for_correct_spaces, polyak_update
 from stable_baselines3.sac.sac import SAC
 from torch.nn import functional as F
@@ -16,11 +15,12 @@ from sb3_robust_bisim.heads import BisimActor, BisimCritic
 from sb3_robust_bisim.intrinsic_reward import bound, with_intrinsic_reward
 from sb3_robust_bisim.objective import Objective
 from sb3_robust_bisim.policies import POLICIES, BisimPolicy
-from sb3_robust_bisim.runs.atomic import PathOrStream, atomic_save
+from sb3_robust_bisim.runs.atomic import PathOrStream
+from sb3_robust_bisim.runs.interruptible import Interruptible
 from sb3_robust_bisim.update_log import UpdateLog, unchecked_distributions
 
 
-class BisimSAC(SAC):
+class BisimSAC(Interruptible, SAC):
     """
     Soft Actor-Critic whose encoder is shaped by a robust on-policy bisimulation metric (Kemertas and Aumentado-Armstrong,
     2021). One encoder z = phi(s), owned by the critic, is trained by critic, metric, dynamics, reward and inverse-dynamics
@@ -285,28 +285,6 @@ class BisimSAC(SAC):
             return super().learn(
                 total_timesteps, checked(callback), log_interval, tb_log_name, reset_num_timesteps, progress_bar
             )
-
-    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
-        whole = False
-        try:
-            rollout = super().collect_rollouts(*args, **kwargs)
-            whole = rollout.continue_training
-            return rollout
-        finally:
-            if not whole:  # a callback has stopped it before the last step was stored: the next learn() begins new episodes
-                self._last_obs = None
-                if isinstance(self.replay_buffer, HerReplayBuffer):
-                    self.replay_buffer.truncate_last_trajectory()
-
-    def save(self, path: PathOrStream, *args: Any, **kwargs: Any) -> None:
-        """Like SB3's ``save``; a file that existed before stays whole until the new one is."""
-        with atomic_save(path, ".zip") as whole:
-            super().save(whole, *args, **kwargs)
-
-    def save_replay_buffer(self, path: PathOrStream) -> None:
-        """Like SB3's ``save_replay_buffer``; a file that existed before stays whole until the new one is."""
-        with atomic_save(path, ".pkl") as whole:
-            super().save_replay_buffer(whole)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()

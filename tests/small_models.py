@@ -5,6 +5,7 @@ from typing import Any
 
 import gymnasium as gym
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
 from stable_baselines3.common.vec_env import VecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -17,6 +18,19 @@ EPISODE = 10
 SMALL: dict[str, Any] = dict(policy_kwargs=dict(net_arch=[16]), learning_starts=EPISODE, batch_size=8, buffer_size=100, seed=0)
 # The parts of the method that are off by default
 EVERYTHING: dict[str, Any] = dict(intrinsic_reward_scale=1.0, inverse_dynamics_coef=1.0)
+
+
+class StopAt(BaseCallback):
+    """Ends training at a step, like a kill. All steps after the last checkpoint are lost."""
+
+    def __init__(self, step: int, error: type[BaseException] | None = None) -> None:
+        super().__init__()
+        self.step, self.error = step, error
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps >= self.step and self.error is not None:
+            raise self.error
+        return self.num_timesteps < self.step
 
 
 def pendulum(reward: float | None = None) -> gym.Env:
@@ -59,8 +73,8 @@ def layers(env: VecEnv | None) -> list[VecEnv]:
     return found
 
 
-def events(folder: Path) -> EventAccumulator:
-    """What a first run of BisimSAC with this ``tensorboard_log`` has written."""
-    accumulator = EventAccumulator(str(folder / "BisimSAC_1"), size_guidance={"images": 0})
+def events(folder: Path, run: int = 1) -> EventAccumulator:
+    """What a run of BisimSAC with this ``tensorboard_log`` has written."""
+    accumulator = EventAccumulator(str(folder / f"BisimSAC_{run}"), size_guidance={"images": 0})
     accumulator.Reload()
     return accumulator

@@ -16,16 +16,15 @@ import numpy as np
 import pytest
 import torch as th
 import yaml
-from small_models import make_model, pendulum
+from small_models import StopAt, events, make_model, pendulum
 from stable_baselines3 import HerReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer, IntrinsicRewardVecEnv
 from sb3_robust_bisim.cli import zoo
@@ -35,17 +34,6 @@ from sb3_robust_bisim.runs.hashed_file import replaced
 
 STEPS = 120
 LEARNING: dict[str, Any] = dict(learning_starts=20, buffer_size=200)
-
-
-class StopAt(BaseCallback):
-    """Ends training at a step, like a kill. All steps after the last checkpoint are lost."""
-
-    def __init__(self, step: int) -> None:
-        super().__init__()
-        self.step = step
-
-    def _on_step(self) -> bool:
-        return self.num_timesteps < self.step
 
 
 def state_task() -> VecEnv:
@@ -92,28 +80,24 @@ def test_resumed_training_equals_uninterrupted_training(task: str, tmp_path: Pat
     np.testing.assert_array_equal(model.env.reset(), expected.env.reset())
 
 
-def steps_in(folder: Path) -> list[int]:
-    found = []
-    for path in folder.rglob("events.*"):
-        events = EventAccumulator(str(path))
-        events.Reload()
-        found += [event.step for event in events.Scalars("rollout/ep_len_mean")]
-    return sorted(found)
-
-
 def test_a_continued_run_logs_where_it_began_though_another_run_has_begun_since(tmp_path: Path) -> None:
+    def steps_of(run: int) -> list[int]:
+        return [event.step for event in events(tmp_path / "runs", run).Scalars("rollout/ep_len_mean")]
+
     logs = dict(tensorboard_log=str(tmp_path / "runs"), env=pendulum(), **LEARNING)
     path = tmp_path / "checkpoint.pkl"
     make_model(**logs).learn(STEPS, CallbackList([Checkpoint(path, 50), StopAt(90)]), log_interval=1)
     make_model(**logs).learn(60, log_interval=1)
-    other = steps_in(tmp_path / "runs/BisimSAC_2")
+    other = steps_of(2)
     model, _ = load_checkpoint(path)
+    model.save(tmp_path / "agent")
+    save_checkpoint(path, model)
     assert read_about(path)["log_folder"] == str(tmp_path / "runs/BisimSAC_1")
     model.learn(STEPS - model.num_timesteps, reset_num_timesteps=False, log_interval=1)
-    assert steps_in(tmp_path / "runs/BisimSAC_1")[-1] == STEPS
-    assert steps_in(tmp_path / "runs/BisimSAC_2") == other
+    assert steps_of(1)[-1] == STEPS
+    assert steps_of(2) == other
     model.learn(20, log_interval=1)  # a new run
-    assert steps_in(tmp_path / "runs/BisimSAC_3") == [10, 20]
+    assert steps_of(3) == [10, 20]
 
 
 def test_a_monitor_file_lists_each_episode_once(tmp_path: Path) -> None:

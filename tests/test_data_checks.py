@@ -10,8 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from small_models import dicts, make_model, pendulum
-from stable_baselines3.common.callbacks import BaseCallback
+from small_models import StopAt, dicts, make_model, pendulum
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
@@ -126,12 +125,7 @@ def test_the_checks_come_before_the_callbacks_of_the_user() -> None:
     assert steps == [2, 4]
 
 
-class Stop(BaseCallback):
-    def _on_step(self) -> bool:
-        return self.n_calls < 3
-
-
-@pytest.mark.parametrize("callback", [Stop(), [Stop()], lambda values, _: values["self"].num_timesteps < 3])
+@pytest.mark.parametrize("callback", [StopAt(3), [StopAt(3)], lambda values, _: values["self"].num_timesteps < 3])
 def test_every_kind_of_callback_still_runs(callback: Any) -> None:
     assert make_model().learn(60, callback).num_timesteps == 3
 

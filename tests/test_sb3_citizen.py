@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from small_models import EPISODE, dicts, images, make_model, parameters, pendulum, with_data
-from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
+from small_models import EPISODE, StopAt, dicts, images, make_model, parameters, pendulum, with_data
+from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -226,23 +226,12 @@ class Counting(gym.Env):
         return np.full(1, self.step_number, dtype=np.float32), 0.0, self.step_number == EPISODE, False, {}
 
 
-class Stop(BaseCallback):
-    def __init__(self, step: int, error: type[BaseException] | None) -> None:
-        super().__init__()
-        self.step, self.error = step, error
-
-    def _on_step(self) -> bool:
-        if self.num_timesteps == self.step and self.error is not None:
-            raise self.error
-        return self.num_timesteps != self.step
-
-
 @pytest.mark.parametrize("error", [None, KeyboardInterrupt])
 @pytest.mark.parametrize("step", [3, EPISODE])
 def test_training_goes_on_in_a_new_episode_after_a_callback_has_stopped_it(step: int, error: Any) -> None:
     model = make_model(env=Counting())
     with nullcontext() if error is None else pytest.raises(error):
-        model.learn(100, Stop(step, error))
+        model.learn(100, StopAt(step, error))
     model.learn(20, reset_num_timesteps=False)
     buffer = model.replay_buffer
     assert buffer.size() == step - 1 + 20  # the callback runs before the transition is stored
@@ -251,7 +240,7 @@ def test_training_goes_on_in_a_new_episode_after_a_callback_has_stopped_it(step:
 
 def test_training_from_pixels_goes_on_after_a_callback_has_stopped_it() -> None:
     model = make_model("CnnPolicy", VecFrameStack(DummyVecEnv([images]), 3))
-    model.learn(100, Stop(13, None)).learn(7, reset_num_timesteps=False)
+    model.learn(100, StopAt(13)).learn(7, reset_num_timesteps=False)
     assert model.replay_buffer.size() == 12 + 7
 
 
@@ -259,7 +248,7 @@ def test_hindsight_replay_ends_the_episode_that_a_callback_has_cut_off() -> None
     env = BitFlippingEnv(n_bits=4, continuous=True, max_steps=5)
     model = make_model("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, intrinsic_reward_scale=0.0)
     with pytest.warns(UserWarning, match="will be truncated"):
-        model.learn(100, Stop(4, None))
+        model.learn(100, StopAt(4))
     model.learn(20, reset_num_timesteps=False)
     buffer = model.replay_buffer
     assert buffer.dones[2]  # of the transitions 0 to 2, which were stored

@@ -23,7 +23,6 @@ import torch as th
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_robust_bisim.runs.hashed_file import damage, opened, previous, replaced
@@ -85,9 +84,8 @@ def save_checkpoint(
     :raises ValueError: for environments that cannot be pickled; the message names the environment and the remedy
     """
     gpus = th.cuda.device_count() if model.device.type == "cuda" else 0
-    logger = getattr(model, "_logger", None)  # there is none before learn()
-    log_folder = None if logger is None else logger.get_dir()
-    header = {"num_timesteps": model.num_timesteps, "versions": _versions(), "gpus": gpus, "log_folder": log_folder}
+    header = {"num_timesteps": model.num_timesteps, "versions": _versions(), "gpus": gpus}
+    header["log_folder"] = getattr(model, "log_folder", None)
     with replaced(Path(path)) as file:
         pickle.dump({**(about or {}), **header}, file)
         pickler = Pickler(file)  # it writes an object once that both dumps contain
@@ -101,8 +99,8 @@ def save_checkpoint(
 
 def read_about(path: str | Path) -> dict[str, Any]:
     """
-    The plain values that were saved with a checkpoint, its ``"num_timesteps"``, the packages' ``"versions"``, and the
-    ``"log_folder"`` in TensorBoard (None: there is none).
+    The plain values that were saved with a checkpoint, its ``"num_timesteps"``, the packages' ``"versions"``, and
+    BisimSAC's ``"log_folder"`` in ``tensorboard_log`` (None: there is none).
 
     :param path: as for :func:`load_checkpoint`, also if the file is damaged
     """
@@ -126,8 +124,8 @@ def load_checkpoint(path: str | Path, env: VecEnv | None = None) -> tuple[Any, A
     """
     Load a model, and restore the global random generators.
 
-    Only load files that you trust: unpickling runs code. Continue with ``learn(..., reset_num_timesteps=False)``. It goes
-    on in the run's folder in ``tensorboard_log``, if there is one. Set a custom logger again, because loggers are not saved.
+    Only load files that you trust: unpickling runs code. Continue with ``learn(..., reset_num_timesteps=False)``. BisimSAC
+    goes on in the run's folder of ``tensorboard_log``. Set a custom logger again, because loggers are not saved.
 
     Loading changes no file. Once training continues, the first finished episode removes the episodes after the checkpoint from
     the Monitor file.
@@ -142,8 +140,7 @@ def load_checkpoint(path: str | Path, env: VecEnv | None = None) -> tuple[Any, A
     """
     path = _intact(Path(path))
     with opened(path) as file:
-        about = pickle.load(file)
-        if (reason := obstacle(about)) and env is None:
+        if (reason := obstacle(pickle.load(file))) and env is None:
             raise ValueError(
                 f"{path}: an exact continuation is not possible, because {reason}. Continue where it was written, or pass env "
                 "(on the command line --new-episodes), to continue with its agent, replay buffer and counters in new episodes."
@@ -154,8 +151,6 @@ def load_checkpoint(path: str | Path, env: VecEnv | None = None) -> tuple[Any, A
             return _with_new_episodes(parts, env), None
         model, context, generators, rollout_begun = unpickler.load()
     model._custom_logger = False  # so that learn() creates a logger
-    if model.tensorboard_log is not None and (log_folder := about.get("log_folder")) is not None:
-        model._setup_learn = partial(_logging_in, log_folder, model)
     if isinstance(getattr(model, "replay_buffer", None), HerReplayBuffer):  # it does not pickle its environment
         model.replay_buffer.set_env(model.env)
     if rollout_begun and model.use_sde:
@@ -224,18 +219,6 @@ def _with_new_episodes(parts: tuple[Any, ...], env: VecEnv) -> BaseAlgorithm:
     if statistics is not None and (normalize := model.get_vec_normalize_env()) is not None:
         normalize.obs_rms, normalize.ret_rms = statistics
     return model
-
-
-def _logging_in(folder: str, model: BaseAlgorithm, steps: int, callback: Any, reset_num_timesteps: bool, *args: Any) -> Any:
-    """Replaces ``_setup_learn`` once. SB3 would go on in the newest folder of ``tensorboard_log``, whichever run's it is."""
-    del model._setup_learn
-    if reset_num_timesteps or model._custom_logger or not Path(folder).is_dir():
-        return model._setup_learn(steps, callback, reset_num_timesteps, *args)
-    model.set_logger(configure(folder, ["stdout", "tensorboard"] if model.verbose >= 1 else ["tensorboard"]))
-    try:
-        return model._setup_learn(steps, callback, reset_num_timesteps, *args)
-    finally:
-        model._custom_logger = False  # the logger is SB3's own again
 
 
 def _skip_next(obj: Any, method: str) -> None:

@@ -2,7 +2,6 @@
 
 import csv
 from collections.abc import Callable, Iterable
-from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,8 @@ REPS, REPS_OF_CURVES = 1000, 200  # bootstrap samples
 MANY = 4  # runs from which on an interquartile mean leaves something out and an interval means something
 FEWEST = {"iqm_return": MANY}
 FULL = "normed-IR-ID"
-# A method looks the same in every figure: colour and dashes; what a figure adds of its own gets the colours that are left
+# A method looks the same in every figure: colour and dashes; what a figure adds of its own gets the colours that are left,
+# then dotted lines
 LOOKS = {
     "SAC": ("C0", "-"),
     "DBC": ("C1", "-"),
@@ -106,7 +106,8 @@ QUANTITIES: dict[str, tuple[Callable[[list[Result], str], Curve], str, str, str]
 def styles(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
     """How each method is drawn."""
     names = {method: method.removesuffix(AS_WRITTEN) for method in methods}
-    free = cycle([look for name, look in LOOKS.items() if name not in names.values()] or LOOKS.values())
+    dotted = [(colour, ":") for colour, _ in LOOKS.values()]
+    free = iter([look for name, look in LOOKS.items() if name not in names.values()] + dotted)
     looks = {name: LOOKS.get(name) or next(free) for name in dict.fromkeys(names.values())}
     return {
         method: {"color": looks[name][0], "linestyle": looks[name][1], "linewidth": 2.0 if method == name else 1.0}

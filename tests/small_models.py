@@ -21,7 +21,7 @@ EVERYTHING: dict[str, Any] = dict(intrinsic_reward_scale=1.0, inverse_dynamics_c
 
 
 class StopAt(BaseCallback):
-    """Ends training at a step, like a kill. All steps after the last checkpoint are lost."""
+    """Ends training at a step, by its return value or by an error."""
 
     def __init__(self, step: int, error: type[BaseException] | None = None) -> None:
         super().__init__()

@@ -92,11 +92,14 @@ def test_a_continued_run_logs_where_it_began_though_another_run_has_begun_since(
     model, _ = load_checkpoint(path)
     model.save(tmp_path / "agent")
     save_checkpoint(path, model)
-    assert read_about(path)["log_folder"] == str(tmp_path / "runs/BisimSAC_1")
+    assert model.log_folder == str(tmp_path / "runs/BisimSAC_1")
     model.learn(STEPS - model.num_timesteps, reset_num_timesteps=False, log_interval=1)
     assert steps_of(1)[-1] == STEPS
     assert steps_of(2) == other
     model.learn(20, log_interval=1)  # a new run
+    assert steps_of(3) == [10, 20]
+    BisimSAC.load(tmp_path / "agent", env=pendulum()).learn(100, reset_num_timesteps=False, log_interval=1)
+    assert steps_of(1)[-1] == 150
     assert steps_of(3) == [10, 20]
 
 

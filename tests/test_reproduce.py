@@ -14,6 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecFrameStack
+
+from sb3_robust_bisim import BisimSAC
 
 pytestmark = pytest.mark.xdist_group("sweeps")  # they share the local sweep and use both cores
 
@@ -179,6 +184,25 @@ def test_no_run_waits_for_another_seed_of_its_method(tmp_path, monkeypatch: pyte
         (tmp_path / f"{name}.json").write_text(json.dumps({"seed": seed}))
         train([], tmp_path / "work" / name, tmp_path / f"{name}.json", {"seed": seed}, "a commit", ())
     assert len(list(tmp_path.glob("work/*.lock"))) == 2
+
+
+def test_the_final_agents_of_all_seeds_play_the_same_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    from reproduce import play
+
+    task = "robust_bisim/cartpole-swingup-pixels-v0"
+    settings = dict(distractor="video", size=16, action_repeat=40)
+    venv = VecFrameStack(make_vec_env(task, 1, env_kwargs=settings), n_stack=3)
+    model = BisimSAC("CnnPolicy", venv, buffer_size=10, seed=0)
+    returns = []
+    for seed in (0, 1):
+        run = tmp_path / str(seed) / "bisim_sac" / "robust_bisim-cartpole-swingup-pixels-v0_1"
+        (run / "task").mkdir(parents=True)
+        (run / "task" / "config.yml").write_text(yaml.dump({"env_kwargs": settings}))
+        model.seed = seed
+        model.save(run / "robust_bisim-cartpole-swingup-pixels-v0")
+        returns.append(play(tmp_path / str(seed), {"env": task}, "eval", n_episodes=2))
+    assert returns[0] == returns[1]
 
 
 def test_a_run_that_broke_off_does_not_hide_the_other_runs(tmp_path) -> None:

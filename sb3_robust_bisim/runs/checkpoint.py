@@ -85,7 +85,6 @@ def save_checkpoint(
     """
     gpus = th.cuda.device_count() if model.device.type == "cuda" else 0
     header = {"num_timesteps": model.num_timesteps, "versions": _versions(), "gpus": gpus}
-    header["log_folder"] = getattr(model, "log_folder", None)
     with replaced(Path(path)) as file:
         pickle.dump({**(about or {}), **header}, file)
         pickler = Pickler(file)  # it writes an object once that both dumps contain
@@ -99,8 +98,7 @@ def save_checkpoint(
 
 def read_about(path: str | Path) -> dict[str, Any]:
     """
-    The plain values that were saved with a checkpoint, its ``"num_timesteps"``, the packages' ``"versions"``, and
-    BisimSAC's ``"log_folder"`` in ``tensorboard_log`` (None: there is none).
+    The plain values that were saved with a checkpoint, its ``"num_timesteps"`` and the packages' ``"versions"``.
 
     :param path: as for :func:`load_checkpoint`, also if the file is damaged
     """

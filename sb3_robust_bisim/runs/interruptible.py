@@ -41,9 +41,6 @@ class Interruptible(OffPolicyAlgorithm):
         folder = Path(self.log_folder)
         return folder.is_dir() and folder.parent == Path(self.tensorboard_log) and folder.name.startswith(f"{tb_log_name}_")
 
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "log_folder"]  # a saved agent begins a run of its own
-
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
         whole = False
         try:

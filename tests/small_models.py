@@ -78,3 +78,8 @@ def events(folder: Path, run: int = 1) -> EventAccumulator:
     accumulator = EventAccumulator(str(folder / f"BisimSAC_{run}"), size_guidance={"images": 0})
     accumulator.Reload()
     return accumulator
+
+
+def logged_steps(folder: Path, key: str, run: int = 1) -> list[int]:
+    """Where a scalar was logged; files of the same second are read in the order of their names, which is not that of time."""
+    return sorted(event.step for event in events(folder, run).Scalars(key))

@@ -10,7 +10,7 @@ import pytest
 import torch as th
 import yaml
 from rl_zoo3.utils import get_callback_list
-from small_models import SMALL, events
+from small_models import SMALL, events, logged_steps
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -317,8 +317,7 @@ def test_a_resumed_run_is_measured_at_the_same_steps(tmp_path: Path) -> None:
     assert model.num_timesteps == 40
     model.learn(60, callback, reset_num_timesteps=False)
     for key in ("denoising_factor", "denoising_factor_heldout"):
-        looks = events(tmp_path).Scalars(f"bisim/{key}")
-        assert [event.step for event in looks] == [30, 50, 60, 90, 100]  # step 50 ended the lost part
+        assert logged_steps(tmp_path, f"bisim/{key}") == [30, 50, 60, 90, 100]  # step 50 ended the lost part
 
 
 def test_a_zoo_yaml_can_name_the_callbacks(tmp_path: Path) -> None:

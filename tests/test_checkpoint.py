@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch as th
 import yaml
-from small_models import StopAt, events, make_model, pendulum
+from small_models import StopAt, logged_steps, make_model, pendulum
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.env_util import make_vec_env
@@ -82,7 +82,7 @@ def test_resumed_training_equals_uninterrupted_training(task: str, tmp_path: Pat
 
 def test_a_continued_run_logs_where_it_began_though_another_run_has_begun_since(tmp_path: Path) -> None:
     def steps_of(run: int) -> list[int]:
-        return [event.step for event in events(tmp_path / "runs", run).Scalars("rollout/ep_len_mean")]
+        return logged_steps(tmp_path / "runs", "rollout/ep_len_mean", run)
 
     logs = dict(tensorboard_log=str(tmp_path / "runs"), env=pendulum(), **LEARNING)
     path = tmp_path / "checkpoint.pkl"

@@ -129,6 +129,18 @@ FIGURES = {
         *(5, 10_000, 500, 10, 17),
         rows=ALL_ROWS,
     ),
+    # what the README shows, from runs of the two figures beside it
+    "headline": Figure(
+        _noisy(CARTPOLE, 2, 3),
+        {
+            "normed-IR-ID": Method(("normed-IR-ID",)),
+            "normed-IR-ID-no-metric": Method(("normed-IR-ID", "no-metric")),
+            "DBC": Method(("DBC",), seeds=5),
+            "SAC": Method(("SAC",), seeds=5),
+        },
+        *(10, 10_000, 500, 10, 17),
+        solved=195.0,
+    ),
     "metric": Figure(
         _noisy(CARTPOLE, 2, 3), _with_and_without_metric(2.0), *(10, 10_000, 500, 10, 17), ALL_ROWS, solved=195.0
     ),

@@ -142,8 +142,9 @@ def draw(name: str, samples: list[dict[str, float]], times: np.ndarray, steps: n
         ax.plot(minutes, [sample[key] for sample in samples])
         ax.set_ylabel(label)
     bins = np.linspace(times[0], times[-1], 41)
-    axes[3].plot((bins[1:] - start) / 60, np.diff(np.interp(bins, times, steps)) / np.diff(bins))
-    axes[3].set(ylabel="steps per second", xlabel="minutes", ylim=(0, None))
+    speed = np.diff(np.interp(bins, times, steps)) / np.diff(bins)
+    axes[3].plot((bins[1:] - start) / 60, speed)
+    axes[3].set(ylabel="steps per second", xlabel="minutes", ylim=(0, 1.1 * speed.max()))
     axes[0].set_title(name)
     with atomic_path(out / f"{name}.png") as temporary:
         picture.savefig(temporary, dpi=90, format="png")

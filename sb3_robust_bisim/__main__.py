@@ -1,4 +1,4 @@
-from sb3_robust_bisim.cli.zoo import main
+from sb3_robust_bisim.cli.zoo import shell
 
 if __name__ == "__main__":
-    main(program="python -m sb3_robust_bisim")
+    shell(program="python -m sb3_robust_bisim")

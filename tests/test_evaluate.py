@@ -182,6 +182,7 @@ def test_enjoy_writes_a_video_of_a_pixel_agent_in_front_of_its_background(pixel_
         (["--video", "agent.gif", "-n", "100"], "one episode of the deterministic policy, so it does not take -n 100"),
         (["--video", "agent.gif", "--seed", "-1"], "--seed -1: must be at least 0"),
         (["--video", "agent.mp4"], "--video imageio.v2 is missing: pip install sb3_robust_bisim[dmc]"),
+        (["--exp-id", "77"], "--exp-id 77: .* has no such run of bisim_sac on robust_bisim/SparseCartPole-v0"),
         (["-f", "empty"], "--folder empty: no run of bisim_sac on robust_bisim/SparseCartPole-v0 has an agent. .* --trained"),
     ],
 )

@@ -21,7 +21,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer
 from sb3_robust_bisim.cli.manager import sample_bisim_sac_params
 from sb3_robust_bisim.cli.report import report
-from sb3_robust_bisim.cli.zoo import SET_BY_THE_USER, main
+from sb3_robust_bisim.cli.zoo import SET_BY_THE_USER, main, shell
 from sb3_robust_bisim.cli.zoo_config import check_keys, variant_settings
 
 ROOT = Path(__file__).parent.parent
@@ -144,7 +144,7 @@ def test_training_from_pixels_ends_with_a_video_and_what_the_agent_sees(zoo: Zoo
         *("-params", "learning_starts:20", "batch_size:4", "buffer_size:60", "n_envs:2"),
     )
     run = tmp_path / "bisim_sac" / "robust_bisim-cartpole-swingup-pixels-v0_1"
-    assert str(run / "agent.mp4") in output
+    assert re.search(rf"Video: .*{run / 'agent.mp4'}.*, one episode with return \d+\.\d\n", output)
     video = imageio.get_reader(run / "agent.mp4")
     assert video.count_frames() == 20
     assert video.get_meta_data()["fps"] == 2.0  # 50 control steps of 10 ms per frame
@@ -201,6 +201,12 @@ def test_bad_input_is_refused_before_a_run_folder_exists(zoo: Zoo, arguments: li
     with pytest.raises(ValueError, match=message):
         zoo("train", "--env", CARTPOLE, *arguments, "-f", str(tmp_path / "logs"))
     assert not (tmp_path / "logs").exists()
+
+
+def test_a_shell_shows_what_a_command_cannot_do_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["robust-bisim", "train", "--env", CARTPOLE, "--variant", "normed-ir"])
+    with pytest.raises(SystemExit, match=r"^robust-bisim: --variant normed-ir: .* has SAC, DBC"):
+        shell()
 
 
 def test_the_error_for_a_task_without_settings_lists_the_tasks_with_settings(zoo: Zoo, tmp_path: Path) -> None:

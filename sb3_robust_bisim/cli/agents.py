@@ -17,6 +17,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_robust_bisim.cli.errors import UsageError
+
 
 def add_agent_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose an agent and its environment. They have the names of rl-zoo3's ``enjoy``."""
@@ -107,7 +109,7 @@ def chosen_agent(args: argparse.Namespace) -> Agent:
     """
     :param args: see :func:`add_agent_arguments`, and ``algo``
     :return: the agent
-    :raises ValueError: see :func:`find_agent`
+    :raises UsageError: see :func:`find_agent`
     """
     for package in args.gym_packages:
         importlib.import_module(package)
@@ -135,7 +137,7 @@ def find_agent(
     :param load_checkpoint: the agent after this number of steps
     :param load_last_checkpoint: the last of these
     :return: the agent
-    :raises ValueError: if there is no such agent
+    :raises UsageError: if there is no such agent
     """
     exp_id = exp_id or latest_run(folder, algo, env, load_best, load_last_checkpoint or load_checkpoint is not None)
     try:
@@ -143,7 +145,7 @@ def find_agent(
             raise ValueError(f"No run of {algo} on {env.gym_id} has an agent")
         _, model, log_path = get_model_path(exp_id, folder, algo, env, load_best, load_checkpoint, load_last_checkpoint)
     except (AssertionError, ValueError) as error:
-        raise ValueError(
+        raise UsageError(
             f"--folder {folder}: {error}. Pass the --folder, --algo and --exp-id of a run that has one, or train it: "
             f"robust-bisim train --env {env.gym_id}"
         ) from error

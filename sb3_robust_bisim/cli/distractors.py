@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
+from sb3_robust_bisim.cli.errors import UsageError
 from sb3_robust_bisim.envs.distractors import DISTRACTORS, ClipDistractor, make_distractor
 from sb3_robust_bisim.envs.noise import NoisyTask, check_noise
 from sb3_robust_bisim.envs.pixels import PixelTask
@@ -26,7 +27,7 @@ class Distractors(ABC):
 
     :param trained: arguments of the environment that the agent was trained in
     :param given: arguments of the environment from the command line
-    :raises ValueError: if ``given`` sets the distraction
+    :raises UsageError: if ``given`` sets the distraction
     """
 
     defaults: ClassVar[EnvKwargs] = {}  # the arguments that are the distraction, with the environment's defaults
@@ -38,29 +39,29 @@ class Distractors(ABC):
         self.trained, self.given = trained, given
         for key in given:
             if key in self.defaults and key not in self.given_allowed:
-                raise ValueError(f"--env-kwargs {key}:{given[key]!r}: --distractors sets it, so pass the name of a distractor")
+                raise UsageError(f"--env-kwargs {key}:{given[key]!r}: --distractors sets it, so pass the name of a distractor")
 
     def env_kwargs(self, name: str) -> dict[str, Any]:
         """
         :param name: a distractor
         :return: the arguments of the environment, of which only the distraction differs from the training
-        :raises ValueError: for an unknown part, for parts that exclude each other, and if the task cannot have the distractor
+        :raises UsageError: for an unknown part, for parts that exclude each other, and if the task cannot have the distractor
         """
         parts: dict[str, Any] = {}
         for word in name.split("+"):
             part = self._part(word)
             if part is None:
                 choices = ", ".join(self.choices)
-                raise ValueError(f"--distractors {name}: there is no {word!r} for this task, only {choices}; + combines them")
+                raise UsageError(f"--distractors {name}: there is no {word!r} for this task, only {choices}; + combines them")
             if twice := sorted(part.keys() & parts.keys()):
-                raise ValueError(f"--distractors {name}: two parts of it set {twice[0]}; omit one of them")
+                raise UsageError(f"--distractors {name}: two parts of it set {twice[0]}; omit one of them")
             parts |= part
         task = {key: value for key, value in {**self.trained, **self.given}.items() if key not in self.defaults}
         distraction = self.distraction(self._complete(parts))
         try:
             self._check(distraction)
         except ValueError as error:
-            raise ValueError(f"--distractors {name}: {error}") from error
+            raise UsageError(f"--distractors {name}: {error}") from error
         return {**task, **distraction}
 
     def distraction(self, env_kwargs: EnvKwargs) -> dict[str, Any]:

@@ -65,7 +65,7 @@ def evaluate(args: argparse.Namespace) -> None:
     Run the command.
 
     :param args: see :func:`add_arguments`, and ``algo``
-    :raises ValueError: if there is no such agent, or for a distractor that does not exist or does not fit the task
+    :raises UsageError: if there is no such agent, or for a distractor that does not exist or does not fit the task
     """
     agent = chosen_agent(args)
     distractors = distractors_of(agent.env_id, agent.env_kwargs, args.env_kwargs)
@@ -87,7 +87,7 @@ def evaluate(args: argparse.Namespace) -> None:
             write_scores(out / CSV, done.values())  # after each, so that an interruption loses little
 
     scores = [replace(done[settings[name]], distractor=name) for name in chosen]
-    title = f"{agent.env_id}, {args.n_episodes} episodes for each distractor"
+    title = f"{agent.env_id}, episodes for each distractor: {args.n_episodes}"
     draw(out / "evaluation.png", scores, title)
     text = f"# {title}\n\nAgent: `{agent.path}`\n\n{markdown(scores)}\n\n"
     by_mean = attrgetter("mean")

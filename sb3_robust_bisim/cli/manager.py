@@ -17,6 +17,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_robust_bisim.bisim_sac import BisimSAC
+from sb3_robust_bisim.cli.errors import UsageError
 from sb3_robust_bisim.cli.record import record_or_explain
 from sb3_robust_bisim.cli.report import report
 from sb3_robust_bisim.cli.zoo_config import check_keys, check_task, entry_of, is_yaml, merged_policy_kwargs, variant_settings
@@ -141,7 +142,7 @@ class BisimExperimentManager(ExperimentManager):
         if self.algo != ALGO or not (self.storage and self.study_name and self.trial_id is not None):
             return {}
         if not is_yaml(self.config):
-            raise ValueError(f"-conf {self.config}: --trial-id needs a YAML file.")
+            raise UsageError(f"-conf {self.config}: --trial-id needs a YAML file.")
         found = self.load_trial(self.storage, self.study_name, self.trial_id)
         configured = {**entry_of(self.config, self.env_name.gym_id), **settings}.get("policy_kwargs", {})
         return {**found, "policy_kwargs": merged_policy_kwargs(configured, found["policy_kwargs"])}
@@ -153,7 +154,7 @@ class BisimExperimentManager(ExperimentManager):
         if checkpoint is None:
             return super().setup_experiment()
         if self.optimize_hyperparameters:
-            raise ValueError("--checkpoint with -optimize: not supported. Optuna saves its trials itself, see --storage.")
+            raise UsageError("--checkpoint with -optimize: not supported. Optuna saves its trials itself, see --storage.")
         if checkpoint.is_file():
             return self._continue(checkpoint)
         return self._begin(checkpoint)
@@ -188,14 +189,14 @@ class BisimExperimentManager(ExperimentManager):
         hyperparams, saved_hyperparams = self.read_hyperparameters()
         about = read_about(checkpoint)
         if "settings" not in about:
-            raise ValueError(f"--checkpoint {checkpoint}: saved from Python, not by this command. Continue it in Python.")
+            raise UsageError(f"--checkpoint {checkpoint}: saved from Python, not by this command. Continue it in Python.")
         if differing := differences(about["settings"], self._settings(saved_hyperparams)):
-            raise ValueError(
+            raise UsageError(
                 f"--checkpoint {checkpoint}: belongs to another run: {differing}. Name another file, or delete it."
             )
         _, self.env_wrapper, _, self.vec_env_wrapper = self._preprocess_hyperparams(hyperparams)
         if self.n_timesteps < about["num_timesteps"]:
-            raise ValueError(f"--n-timesteps {self.n_timesteps}: {checkpoint} is at step {about['num_timesteps']} already.")
+            raise UsageError(f"--n-timesteps {self.n_timesteps}: {checkpoint} is at step {about['num_timesteps']} already.")
         if self.options.new_episodes and (reason := obstacle(about)):
             new_model, saved_hyperparams = self._begin(checkpoint)
             model, _ = load_checkpoint(checkpoint, env=new_model.env)

@@ -41,7 +41,7 @@ def record_or_explain(model: BaseAlgorithm, make_venv: Callable[[], VecEnv], fol
     :param model: see :func:`record`
     :param make_venv: makes the environment of :func:`record`
     :param folder: see :func:`record`
-    :return: the paths of the files, or the reason why there are none: a missing package, or no OpenGL
+    :return: the files and the return, or the reason why there are none: a missing package, or no OpenGL
     """
     try:
         _imageio()
@@ -52,26 +52,27 @@ def record_or_explain(model: BaseAlgorithm, make_venv: Callable[[], VecEnv], fol
     except RuntimeError as error:
         return f"not recorded, {error}"
     with closing(venv):
-        return " ".join(map(str, record(model, venv, folder)))
+        paths, total_reward = record(model, venv, folder)
+    return f"{' '.join(map(str, paths))}, one episode with return {total_reward:.1f}"
 
 
-def record(model: BaseAlgorithm, venv: VecEnv, folder: Path) -> list[Path]:
+def record(model: BaseAlgorithm, venv: VecEnv, folder: Path) -> tuple[list[Path], float]:
     """
     Record one episode.
 
     :param model: see :func:`play`
     :param venv: see :func:`play`
     :param folder: receives ``agent.mp4`` and, for frames, ``what_the_agent_sees.png``
-    :return: the paths of the files
+    :return: the paths of the files, and the undiscounted return of the episode
     :raises ImportError: if a package of the extra ``dmc`` is missing
     """
     episode = play(model, venv)
     write_video(folder / "agent.mp4", episode.shown, episode.fps)
     if not episode.seen:
-        return [folder / "agent.mp4"]
+        return [folder / "agent.mp4"], episode.total_reward
     with atomic_path(folder / "what_the_agent_sees.png") as temporary:
         Image.fromarray(contact_sheet(episode.seen)).save(temporary)
-    return [folder / "agent.mp4", folder / "what_the_agent_sees.png"]
+    return [folder / "agent.mp4", folder / "what_the_agent_sees.png"], episode.total_reward
 
 
 def play(model: BaseAlgorithm, venv: VecEnv) -> Episode:

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import bootstrap
 
+from sb3_robust_bisim.cli.errors import UsageError
 from sb3_robust_bisim.runs.atomic import atomic_path
 
 COLUMNS = (
@@ -69,14 +70,14 @@ def read_scores(path: Path) -> dict[str, Score]:
     """
     :param path: CSV file of :func:`write_scores`; it may be missing
     :return: its rows, by their settings
-    :raises ValueError: if it is another file
+    :raises UsageError: if it is another file
     """
     if not path.exists():
         return {}
     with path.open(newline="") as file:
         rows = csv.DictReader(file)
         if tuple(rows.fieldnames or ()) != COLUMNS:
-            raise ValueError(f"{path}: not a table of this command or of this version; pass another --out, or move the file")
+            raise UsageError(f"{path}: not a table of this command or of this version; pass another --out, or move the file")
         return {row["settings"]: _score(row) for row in rows}
 
 

@@ -23,6 +23,7 @@ from rl_zoo3.utils import EnvironmentName
 from sb3_robust_bisim.bisim_sac import BisimSAC
 from sb3_robust_bisim.cli.agents import add_agent_arguments, latest_run
 from sb3_robust_bisim.cli.enjoy import record_episode, trained_run, trained_tasks
+from sb3_robust_bisim.cli.errors import UsageError
 from sb3_robust_bisim.cli.evaluate import DESCRIPTION, add_arguments, check_arguments, evaluate
 from sb3_robust_bisim.cli.manager import ALGO, BisimExperimentManager, RunOptions, sample_bisim_sac_params
 from sb3_robust_bisim.cli.record import check_video
@@ -35,6 +36,14 @@ HYPERPARAMS_CONVERTER[ALGO] = convert_offpolicy_params
 COMMANDS = ("train", "enjoy", "evaluate", "plot_train", "plot_from_file", "all_plots")
 CHANGED = "rl-zoo3's command with these options changed or added:"
 SET_BY_THE_USER = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OMP_WAIT_POLICY")
+
+
+def shell(program: str = "robust-bisim") -> None:
+    """Run the command of the process; what it cannot do is said in one line."""
+    try:
+        main(program=program)
+    except UsageError as error:
+        sys.exit(f"{program}: {error}")
 
 
 def main(arguments: Sequence[str] | None = None, program: str = "robust-bisim") -> None:
@@ -204,6 +213,8 @@ def _enjoy(program: str, arguments: list[str]) -> None:
                     f"of one that has, or train it: robust-bisim train --env {ours.env.gym_id}. --trained plays an agent that "
                     f"comes with the package, for {', '.join(trained_tasks())}."
                 )
+        if ours.exp_id > 0 and ours.env is not None and not Path(found, ours.algo, f"{ours.env}_{ours.exp_id}").is_dir():
+            parser.error(f"--exp-id {ours.exp_id}: {found} has no such run of {ours.algo} on {ours.env.gym_id}.")
         env = [] if ours.env is None else ["--env", ours.env.gym_id]
         with _replaced(sys, "argv", [program, *theirs, "-f", found, "--exp-id", str(ours.exp_id), *env]):
             rl_zoo3.enjoy.enjoy()

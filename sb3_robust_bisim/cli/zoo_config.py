@@ -9,6 +9,7 @@ from stable_baselines3 import SAC
 
 from sb3_robust_bisim.bisim_sac import BisimSAC
 from sb3_robust_bisim.checks import closest
+from sb3_robust_bisim.cli.errors import UsageError
 
 PACKAGE = Path(__file__).parents[1]
 # A wheel has the configurations inside the package. In the repository they are next to it, also for an editable install.
@@ -49,17 +50,17 @@ def variant_settings(config: str | Path, env_id: str, *names: str) -> dict[str, 
     :param env_id: the task
     :param names: variants, for example ("DBC",) or ("SAC", "clean", "small")
     :return: the keys that the variants set, to be laid over the entry
-    :raises ValueError: if the file has no such variant
+    :raises UsageError: if the file has no such variant
     """
     if not is_yaml(config):
-        raise ValueError(f"-conf {config}: --variant needs a YAML file.")
+        raise UsageError(f"-conf {config}: --variant needs a YAML file.")
     content = _read(config)
     entry = content.get(env_id, {})
     general, own = content.get("variants") or {}, entry.get("variants") or {}
     settings: dict[str, Any] = {}
     for name in names:
         if name not in general and name not in own:
-            raise ValueError(f"--variant {name}: for {env_id}, {config} has {', '.join({**general, **own}) or 'no variants'}.")
+            raise UsageError(f"--variant {name}: for {env_id}, {config} has {', '.join({**general, **own}) or 'no variants'}.")
         settings = _merged(_merged(settings, general.get(name, {})), own.get(name, {}))
     return {key: value for key, value in _merged(entry, settings).items() if key in settings}
 
@@ -70,12 +71,12 @@ def check_keys(hyperparams: dict[str, Any], source: str) -> None:
 
     :param hyperparams: an entry of a config file for BisimSAC
     :param source: file or option, for the message
-    :raises ValueError: with the key and the closest known one
+    :raises UsageError: with the key and the closest known one
     """
     known = {*ZOO_KEYS, *inspect.signature(BisimSAC).parameters, *inspect.signature(SAC).parameters} - PASSED_BY_THE_ZOO
     for key in hyperparams:
         if key not in known:
-            raise ValueError(f"{source}: unknown key {key!r}{closest(key, known)}")
+            raise UsageError(f"{source}: unknown key {key!r}{closest(key, known)}")
 
 
 def check_task(env_id: str, config: str) -> None:
@@ -84,13 +85,13 @@ def check_task(env_id: str, config: str) -> None:
 
     :param env_id: the task
     :param config: file with hyperparameters; only YAML files are checked
-    :raises ValueError: with the tasks that have an entry
+    :raises UsageError: with the tasks that have an entry
     """
     if not is_yaml(config):
         return
     tasks = [key for key in _read(config) if key != "variants"]
     if env_id not in tasks and "default" not in tasks:  # rl-zoo3 uses "default" for any task
-        raise ValueError(
+        raise UsageError(
             f"--env {env_id}: {config} has settings for {', '.join(tasks)}. Copy the entry of a similar task to your own "
             "file, rename it, and pass the file with -conf."
         )

@@ -17,17 +17,19 @@ from _figures import FIGURES
 from sb3_robust_bisim.runs.atomic import atomic_path
 
 RESULTS = Path(__file__).parent / "results"
-# Heading: environment and panel
-TASKS: dict[str, tuple[str, str]] = {
-    "cartpole, N_m = 0": ("robust_bisim/SparseCartPole-v0", "N_m=0"),
-    "N_m = 2": ("robust_bisim/SparseCartPole-v0", "N_m=2"),
-    "N_m = 3": ("robust_bisim/SparseCartPole-v0", "N_m=3"),
-    "mountain car, N_m = 2": ("robust_bisim/MountainCarContinuous-v0", "N_m=2"),
-    "swingup_sparse, state": ("robust_bisim/cartpole-swingup_sparse-v0", "cartpole-swingup_sparse"),
-    "cheetah-run, state": ("robust_bisim/cheetah-run-v0", "cheetah-run"),
-    "swingup, video": ("robust_bisim/cartpole-swingup-pixels-v0", "video"),
+ON_CARTPOLE = ("cartpole", "dbc_alt", "metric")
+# Heading: panel, and the figures that have it
+TASKS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "cartpole, N_m = 0": ("N_m=0", ON_CARTPOLE),
+    "N_m = 2": ("N_m=2", ON_CARTPOLE),
+    "N_m = 3": ("N_m=3", ON_CARTPOLE),
+    "mountain car, N_m = 2": ("N_m=2", ("mountain_car",)),
+    "swingup_sparse, state": ("cartpole-swingup_sparse", ("dmc_state",)),
+    "swingup_sparse, projected": ("cartpole-swingup_sparse", ("metric_control",)),
+    "cheetah-run, state": ("cheetah-run", ("dmc_state",)),
+    "cheetah-run, projected": ("cheetah-run", ("metric_control",)),
+    "swingup, video": ("video", ("dmc_pixels",)),
 }
-FIGURES_OF_METHODS = ("cartpole", "dbc_alt", "metric", "mountain_car", "dmc_state", "dmc_pixels")
 METHODS = {  # in the figures: in the table
     "SAC": "SAC",
     "SAC-shift": "SAC with random shift",
@@ -50,13 +52,13 @@ METHODS = {  # in the figures: in the table
 }
 
 
-def last_returns(env_id: str, panel: str) -> dict[str, list[float]]:
+def last_returns(panel: str, figures: tuple[str, ...]) -> dict[str, list[float]]:
     """The last return of each run of a task by method."""
     found: dict[str, dict[int, float]] = {}
-    for figure in FIGURES_OF_METHODS:
+    for figure in figures:
         for path in sorted((RESULTS / figure).glob("*_seed*.json")):
             run = json.loads(path.read_text())
-            if (run["env"], run["panel"], run["steps"]) == (env_id, panel, FIGURES[figure].steps):
+            if (run["panel"], run["steps"]) == (panel, FIGURES[figure].steps):
                 found.setdefault(run["method"], {})[run["seed"]] = float(np.mean(run["evaluations"][-1]["returns"]))
     return {method: list(seeds.values()) for method, seeds in found.items()}
 

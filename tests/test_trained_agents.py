@@ -1,6 +1,9 @@
 """The trained agents that come with the package: small, without pickle, and as good as their cards say."""
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -24,6 +27,18 @@ def test_an_agent_returns_what_its_card_says(task: str, tmp_path: Path, capsys: 
     main(["enjoy", "--env", task, "--trained", "--no-render", "-n", "1000"])  # five episodes of 200 steps, or more and shorter
     played = capsys.readouterr().out
     assert float(re.findall(r"Mean reward: ([\d.]+)", played)[0]) > 0.9 * float(mean)
+
+
+def test_a_video_of_it_needs_no_display_and_says_nothing_of_one(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "sb3_robust_bisim", "enjoy", "--env", CARTPOLE, "--trained", "--video", "agent.gif"]
+    headless = {
+        key: value for key, value in os.environ.items() if key not in ("DISPLAY", "XDG_RUNTIME_DIR", "SDL_VIDEODRIVER")
+    }
+    headless["PYTHONPATH"] = str(TRAINED.parents[1])
+    done = subprocess.run(command, cwd=tmp_path, env=headless, capture_output=True, text=True, timeout=300, check=True)
+    assert "XDG" not in done.stderr
+    assert "Agent: the one that comes with the package\n" in done.stdout
+    assert (tmp_path / "agent.gif").exists()
 
 
 def test_an_agent_that_the_package_does_not_have_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

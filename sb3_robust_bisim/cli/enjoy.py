@@ -21,7 +21,7 @@ def record_episode(args: argparse.Namespace) -> str:
     """
     Write a video of one episode of the deterministic policy.
 
-    :param args: see :func:`~sb3_robust_bisim.cli.agents.add_agent_arguments`; also ``algo`` and ``video``, the file
+    :param args: see :func:`~sb3_robust_bisim.cli.agents.add_agent_arguments`; also ``algo``, ``trained`` and ``video``, the file
     :return: the agent, the return and the file, for the user
     :raises ValueError: if there is no such agent, or if the task renders no frames
     """
@@ -32,7 +32,8 @@ def record_episode(args: argparse.Namespace) -> str:
         venv.seed(args.seed)  # loading has set the seed of the training
         episode = play(model, venv)
     write_video(args.video, episode.shown, episode.fps)
-    return f"Agent: {agent.path}\nEpisode: {len(episode.shown)} steps, return {episode.total_reward:.2f}\nVideo: {args.video}"
+    name = "the one that comes with the package" if args.trained else agent.path
+    return f"Agent: {name}\nEpisode: {len(episode.shown)} steps, return {episode.total_reward:.2f}\nVideo: {args.video}"
 
 
 def trained_tasks() -> list[str]:

@@ -236,7 +236,7 @@ def _video_arguments(program: str, arguments: list[str]) -> argparse.Namespace:
     except (ValueError, ImportError) as error:
         parser.error(f"--video {error}")
     _check_writable(parser, "--video", args.video)
-    _set_threads(args)
+    _prepare(args)
     return args
 
 
@@ -246,7 +246,7 @@ def _evaluate_arguments(program: str, arguments: list[str]) -> argparse.Namespac
     add_arguments(parser)
     args = parser.parse_args(arguments)
     check_arguments(parser, args)
-    _set_threads(args)
+    _prepare(args)
     return args
 
 
@@ -280,8 +280,9 @@ def _n_threads(args: argparse.Namespace) -> int:
     return -1 if any(name in os.environ for name in SET_BY_THE_USER) else 1
 
 
-def _set_threads(args: argparse.Namespace) -> None:
-    """For the commands that are not rl-zoo3's."""
+def _prepare(args: argparse.Namespace) -> None:
+    """For the commands that are not rl-zoo3's: the number of threads, and no window, which SDL would look for in vain."""
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     if (n_threads := _n_threads(args)) > 0:
         th.set_num_threads(n_threads)
 

@@ -21,7 +21,8 @@ def record_episode(args: argparse.Namespace) -> str:
     """
     Write a video of one episode of the deterministic policy.
 
-    :param args: see :func:`~sb3_robust_bisim.cli.agents.add_agent_arguments`; also ``algo``, ``trained`` and ``video``, the file
+    :param args: see :func:`~sb3_robust_bisim.cli.agents.add_agent_arguments`; also ``algo``, ``trained``, and ``video``, the
+        file
     :return: the agent, the return and the file, for the user
     :raises ValueError: if there is no such agent, or if the task renders no frames
     """

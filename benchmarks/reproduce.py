@@ -2,8 +2,8 @@
 Repeat a figure of the paper: every method, task and seed through the zoo's command line, then curves and tables.
 
 Each run trains with zoo_configs/bisim_sac.yml and leaves one JSON file in benchmarks/results/FIGURE. A finished run is not run
-again, an interrupted one goes on from its checkpoint, exactly. --dry-run shows the commands. The last line printed is one JSON
-object.
+again, and the repository has those of the published figures: --out FOLDER trains them again. An interrupted run goes on from
+its checkpoint, exactly. --dry-run shows the commands. The last line printed is one JSON object.
 """
 
 import argparse
@@ -398,7 +398,11 @@ def main() -> None:
     done = [result for result in results.values() if result is not None]
     minutes = seconds_left(todo, done, figure) / 60
     rest = f"{minutes:.0f} minutes" if minutes < 90 else f"{minutes / 60:.1f} hours"
-    left = f"the rest takes {rest} of one core" if todo else "nothing is left to run"
+    left = (
+        f"the rest takes {rest} of one core"
+        if todo
+        else f"nothing is left to run (--out FOLDER trains again: {out} has the results)"
+    )
     print(f"{len(done)} of {len(runs)} runs have ended; {left}.", file=sys.stderr)
     if args.dry_run:
         for run in todo:

@@ -19,7 +19,7 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer
-from sb3_robust_bisim.cli.manager import sample_bisim_sac_params
+from sb3_robust_bisim.cli.manager import BisimExperimentManager, sample_bisim_sac_params
 from sb3_robust_bisim.cli.report import report
 from sb3_robust_bisim.cli.zoo import SET_BY_THE_USER, main, shell
 from sb3_robust_bisim.cli.zoo_config import check_keys, variant_settings
@@ -210,7 +210,7 @@ def test_a_shell_shows_what_a_command_cannot_do_in_one_line(monkeypatch: pytest.
 
 
 def test_the_error_for_a_task_without_settings_lists_the_tasks_with_settings(zoo: Zoo, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"--env Pendulum-v1: .* robust_bisim/SparsePendulum-v0.* Copy the entry"):
+    with pytest.raises(ValueError, match=r"--env Pendulum-v1: .* robust_bisim/SparsePendulum-v0.* Copy the file, rename"):
         zoo("train", "--env", "Pendulum-v1", "-f", str(tmp_path / "logs"))
     assert not (tmp_path / "logs").exists()
 
@@ -235,6 +235,20 @@ def test_the_report_calls_an_agent_trained_only_after_training(
     np.savez(tmp_path / "evaluations.npz", timesteps=[20, 40], results=[[1.0, 2.0], [3.0, 1.0]])
     report(tmp_path, "a run", starts)
     assert last in capsys.readouterr().out
+
+
+def test_runs_that_begin_together_have_folders_of_their_own(zoo: Zoo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = tmp_path / "bisim_sac" / "robust_bisim-SparseCartPole-v0_1"
+    preprocess = BisimExperimentManager._preprocess_hyperparams
+
+    def meanwhile(manager: BisimExperimentManager, *args: Any) -> Any:  # rl-zoo3 has chosen the number by then
+        taken.mkdir(parents=True)
+        return preprocess(manager, *args)
+
+    monkeypatch.setattr(BisimExperimentManager, "_preprocess_hyperparams", meanwhile)
+    output = zoo("train", "--env", CARTPOLE, "--eval-freq", "-1", "-f", str(tmp_path), *SHORT)
+    assert f"Model:          {taken.with_name('robust_bisim-SparseCartPole-v0_2')}/" in output
+    assert not list(taken.iterdir())
 
 
 def test_a_config_may_have_one_entry_for_all_tasks_and_no_variants(zoo: Zoo, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -158,6 +159,21 @@ class BisimExperimentManager(ExperimentManager):
         if checkpoint.is_file():
             return self._continue(checkpoint)
         return self._begin(checkpoint)
+
+    def create_log_folder(self) -> None:
+        """Take the next free number: rl-zoo3 chose one before it made the folder, and another run may have begun since."""
+        stem, number = self.save_path.rsplit("_", 1)
+        if number.isdigit():  # not with -uuid
+            Path(self.log_path).mkdir(parents=True, exist_ok=True)
+            for free in count(int(number)):
+                try:
+                    Path(f"{stem}_{free}").mkdir()
+                except FileExistsError:
+                    continue
+                self.save_path = f"{stem}_{free}"
+                self.params_path = f"{self.save_path}/{self.env_name}"
+                break
+        super().create_log_folder()
 
     def _begin(self, checkpoint: Path) -> tuple[BaseAlgorithm, dict[str, Any]]:
         """Create a run that writes checkpoints."""

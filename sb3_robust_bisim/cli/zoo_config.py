@@ -92,8 +92,8 @@ def check_task(env_id: str, config: str) -> None:
     tasks = [key for key in _read(config) if key != "variants"]
     if env_id not in tasks and "default" not in tasks:  # rl-zoo3 uses "default" for any task
         raise UsageError(
-            f"--env {env_id}: {config} has settings for {', '.join(tasks)}. Copy the entry of a similar task to your own "
-            "file, rename it, and pass the file with -conf."
+            f"--env {env_id}: {config} has settings for {', '.join(tasks)}. Copy the file, rename the entry of a similar "
+            "task in the copy, and pass the copy with -conf."
         )
 
 

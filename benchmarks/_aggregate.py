@@ -29,6 +29,7 @@ LOOKS = {
     "normed-IR": ("C3", "--"),
     "normed-ID": ("C4", "-."),
     FULL: ("C5", "-"),
+    f"{FULL}-no-metric": ("C5", ":"),
     "self-prediction": ("C6", "-"),
     "self-prediction-IR": ("C7", "-"),
     "DBC-IR": ("C8", "-"),

@@ -2,8 +2,9 @@
 What is compared: tasks, methods, seeds and steps, after the figures of the paper. The settings are those of zoo_configs/.
 
 At a scale that a small machine finishes: the paper runs 10 seeds (5 from pixels), 50,000 steps of cartpole, 100,000 of
-pendulum and mountain car, 500,000 of each of 16 environments from pixels. `dmc_state`, `bf16`, `metric`, `metric_control`, the
-methods `self-prediction` and `self-prediction-IR` and those with `half` in their names are not in the paper.
+pendulum and mountain car, 500,000 of each of 16 environments from pixels. `dmc_state`, `bf16`, `headline`, `metric`,
+`metric_control`, the methods `self-prediction` and `self-prediction-IR` and those with `half` in their names are not in the
+paper.
 """
 
 from dataclasses import dataclass, field
@@ -133,8 +134,7 @@ FIGURES = {
     "headline": Figure(
         _noisy(CARTPOLE, 2, 3),
         {
-            "normed-IR-ID": Method(("normed-IR-ID",)),
-            "normed-IR-ID-no-metric": Method(("normed-IR-ID", "no-metric")),
+            **{name: _with_and_without_metric(2.0)[name] for name in ("normed-IR-ID", "normed-IR-ID-no-metric")},
             "DBC": Method(("DBC",), seeds=5),
             "SAC": Method(("SAC",), seeds=5),
         },

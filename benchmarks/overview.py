@@ -18,7 +18,7 @@ from sb3_robust_bisim.runs.atomic import atomic_path
 
 RESULTS = Path(__file__).parent / "results"
 ON_CARTPOLE = ("cartpole", "dbc_alt", "metric")
-# Heading: panel, and the figures that have it
+# Heading: panel, and the figures to look in
 TASKS: dict[str, tuple[str, tuple[str, ...]]] = {
     "cartpole, N_m = 0": ("N_m=0", ON_CARTPOLE),
     "N_m = 2": ("N_m=2", ON_CARTPOLE),

@@ -360,10 +360,11 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument(
         "--out", type=Path, help="results (default: benchmarks/results; for other settings than the figure's, WORK/results)"
     )
-    parser.add_argument("--work", type=Path, default=Path("logs/reproduce"), help="run folders (default: %(default)s)")
+    parser.add_argument("--work", type=Path, help="run folders (default: OUT/work if --out is given, else logs/reproduce)")
     parser.add_argument("--dry-run", action="store_true", help="show the commands and how long they should take")
     parser.add_argument("--only-draw", action="store_true", help="curves and tables of the runs that have ended")
     args = parser.parse_args()
+    args.work = args.work or (args.out / "work" if args.out else Path("logs/reproduce"))
     try:
         args.params = dict(sorted(map(setting, args.params)))
     except ValueError as error:

@@ -209,6 +209,13 @@ def test_a_shell_shows_what_a_command_cannot_do_in_one_line(monkeypatch: pytest.
         shell()
 
 
+def test_a_numbered_run_that_rl_zoo3_downloads_is_left_to_it(zoo: Zoo, monkeypatch: pytest.MonkeyPatch) -> None:
+    played: list[str] = []
+    monkeypatch.setattr(rl_zoo3.enjoy, "enjoy", lambda: played.extend(sys.argv))
+    zoo("enjoy", "--algo", "sac", "--env", "Pendulum-v1", "-f", "rl-trained-agents", "--exp-id", "1")
+    assert played[played.index("--exp-id") + 1] == "1"
+
+
 def test_the_error_for_a_task_without_settings_lists_the_tasks_with_settings(zoo: Zoo, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"--env Pendulum-v1: .* robust_bisim/SparsePendulum-v0.* Copy the file, rename"):
         zoo("train", "--env", "Pendulum-v1", "-f", str(tmp_path / "logs"))

@@ -71,7 +71,8 @@ def main(arguments: Sequence[str] | None = None, program: str = "robust-bisim") 
     elif command == "enjoy":
         _enjoy(program, options)
     elif command == "evaluate":
-        evaluate(_evaluate_arguments(program, options))
+        with _no_window():
+            evaluate(_evaluate_arguments(program, options))
     else:
         try:
             from rl_zoo3 import plots
@@ -90,6 +91,20 @@ def _replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
         yield
     finally:
         setattr(owner, name, before)
+
+
+@contextmanager
+def _no_window() -> Iterator[None]:
+    """Draw without a window for the length of a command: SDL would look for a display, and complain that there is none."""
+    key = "SDL_VIDEODRIVER"
+    if key in os.environ:
+        yield
+        return
+    os.environ[key] = "dummy"
+    try:
+        yield
+    finally:
+        del os.environ[key]
 
 
 @contextmanager
@@ -202,18 +217,21 @@ def _enjoy(program: str, arguments: list[str]) -> None:
     with trained_run(ALGO, ours.env) if ours.trained else nullcontext(ours.folder) as found:
         if video is not None:
             video.folder = found
-            print(record_episode(video))
+            with _no_window():
+                print(record_episode(video))
             return
+        local = "rl-trained-agents" not in found  # rl-zoo3 downloads those
         if ours.exp_id == 0 and ours.env is not None:
             from_training = any(argument.startswith(("--load-checkpoint", "--load-last-checkpoint")) for argument in arguments)
             ours.exp_id = latest_run(found, ours.algo, ours.env, "--load-best" in arguments, from_training)
-            if ours.exp_id == 0 and "rl-trained-agents" not in found:  # rl-zoo3 downloads those
+            if ours.exp_id == 0 and local:
                 parser.error(
                     f"--folder {found}: no run of {ours.algo} on {ours.env.gym_id} has an agent. Pass the --folder and --algo "
                     f"of one that has, or train it: robust-bisim train --env {ours.env.gym_id}. --trained plays an agent that "
                     f"comes with the package, for {', '.join(trained_tasks())}."
                 )
-        if ours.exp_id > 0 and ours.env is not None and not Path(found, ours.algo, f"{ours.env}_{ours.exp_id}").is_dir():
+        run = Path(found, ours.algo, f"{ours.env}_{ours.exp_id}")
+        if local and ours.env is not None and ours.exp_id > 0 and not run.is_dir():
             parser.error(f"--exp-id {ours.exp_id}: {found} has no such run of {ours.algo} on {ours.env.gym_id}.")
         env = [] if ours.env is None else ["--env", ours.env.gym_id]
         with _replaced(sys, "argv", [program, *theirs, "-f", found, "--exp-id", str(ours.exp_id), *env]):
@@ -236,7 +254,7 @@ def _video_arguments(program: str, arguments: list[str]) -> argparse.Namespace:
     except (ValueError, ImportError) as error:
         parser.error(f"--video {error}")
     _check_writable(parser, "--video", args.video)
-    _prepare(args)
+    _set_threads(args)
     return args
 
 
@@ -246,7 +264,7 @@ def _evaluate_arguments(program: str, arguments: list[str]) -> argparse.Namespac
     add_arguments(parser)
     args = parser.parse_args(arguments)
     check_arguments(parser, args)
-    _prepare(args)
+    _set_threads(args)
     return args
 
 
@@ -280,9 +298,8 @@ def _n_threads(args: argparse.Namespace) -> int:
     return -1 if any(name in os.environ for name in SET_BY_THE_USER) else 1
 
 
-def _prepare(args: argparse.Namespace) -> None:
-    """For the commands that are not rl-zoo3's: the number of threads, and no window, which SDL would look for in vain."""
-    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+def _set_threads(args: argparse.Namespace) -> None:
+    """For the commands that are not rl-zoo3's."""
     if (n_threads := _n_threads(args)) > 0:
         th.set_num_threads(n_threads)
 

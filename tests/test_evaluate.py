@@ -182,8 +182,9 @@ def test_enjoy_writes_a_video_of_a_pixel_agent_in_front_of_its_background(pixel_
         (["--video", "agent.gif", "-n", "100"], "one episode of the deterministic policy, so it does not take -n 100"),
         (["--video", "agent.gif", "--seed", "-1"], "--seed -1: must be at least 0"),
         (["--video", "agent.mp4"], "--video imageio.v2 is missing: pip install sb3_robust_bisim[dmc]"),
-        (["--exp-id", "77"], "--exp-id 77: .* has no such run of bisim_sac on robust_bisim/SparseCartPole-v0"),
-        (["-f", "empty"], "--folder empty: no run of bisim_sac on robust_bisim/SparseCartPole-v0 has an agent. .* --trained"),
+        (["--exp-id", "77"], "--exp-id 77: .*_77 folder was not found. Pass the --folder, .* --trained plays"),
+        (["--load-checkpoint", "9"], "--folder .*: No run of .* has an agent"),
+        (["-f", "empty"], "--folder empty: No run of bisim_sac on robust_bisim/SparseCartPole-v0 has an agent. .* --trained"),
     ],
 )
 def test_enjoy_refuses_before_any_work(
@@ -211,7 +212,7 @@ def test_enjoy_refuses_before_any_work(
         (["--distractors", "std=2+std=3"], "two parts of it set noise_std"),
         (["--distractors", "std=-1"], "--distractors std=-1: noise_std must be a finite number >= 0"),
         (["--env-kwargs", "noise_mean:1"], "--env-kwargs noise_mean:1: --distractors sets it"),
-        (["--exp-id", "7"], "--folder .*_7 folder was not found. Pass the --folder"),
+        (["--exp-id", "7"], "--exp-id 7: .*_7 folder was not found. Pass the --folder"),
         (["--algo", "sac"], "--folder .*No run of sac on .*SparseCartPole-v0 has an agent"),
         (["--load-best"], "--folder .*No run of bisim_sac on .*SparseCartPole-v0 has an agent"),
     ],

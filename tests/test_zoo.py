@@ -467,7 +467,7 @@ def test_torch_uses_one_thread_unless_the_user_chooses_otherwise(
         monkeypatch.setenv(name, value)
     seen: list[list[str]] = []
     monkeypatch.setattr(getattr(rl_zoo3, command), command, lambda: seen.append(list(sys.argv)))
-    main([command, *arguments])
+    main([command, "--env", CARTPOLE, "-f", "rl-trained-agents", *arguments])
     assert seen[0].count("--num-threads") == 1
     assert seen[0][seen[0].index("--num-threads") + 1] == threads
 

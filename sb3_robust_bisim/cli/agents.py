@@ -57,6 +57,7 @@ class Agent:
     :param stats: folder with the settings and the statistics of VecNormalize; None: there are none
     :param hyperparams: saved hyperparameters, which name the wrappers of the environment
     :param env_kwargs: arguments of the environment
+    :param exp_id: number of its run; -1: the agent is not in the folder of a run
     """
 
     algo: str
@@ -65,6 +66,7 @@ class Agent:
     stats: str | None
     hyperparams: dict[str, Any]
     env_kwargs: dict[str, Any]
+    exp_id: int
 
     def make_env(self, env_kwargs: Mapping[str, Any], seed: int) -> VecEnv:
         """
@@ -145,8 +147,9 @@ def find_agent(
             raise ValueError(f"No run of {algo} on {env.gym_id} has an agent")
         _, model, log_path = get_model_path(exp_id, folder, algo, env, load_best, load_checkpoint, load_last_checkpoint)
     except (AssertionError, ValueError) as error:
+        cause = f"--exp-id {exp_id}" if exp_id else f"--folder {folder}"
         raise UsageError(
-            f"--folder {folder}: {error}. Pass the --folder, --algo and --exp-id of a run that has one, or train it: "
+            f"{cause}: {error}. Pass the --folder, --algo and --exp-id of a run that has one, or train it: "
             f"robust-bisim train --env {env.gym_id}"
         ) from error
     stats = os.path.join(log_path, env)
@@ -155,4 +158,4 @@ def find_agent(
     arguments = Path(stats, "args.yml")
     if arguments.is_file():  # --env-kwargs of the training replaces those of the configuration
         env_kwargs = yaml.unsafe_load(arguments.read_text())["env_kwargs"] or env_kwargs
-    return Agent(algo, env.gym_id, Path(model), found_stats, hyperparams, env_kwargs)
+    return Agent(algo, env.gym_id, Path(model), found_stats, hyperparams, env_kwargs, exp_id)

@@ -21,7 +21,7 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, 
 from rl_zoo3.utils import EnvironmentName
 
 from sb3_robust_bisim.bisim_sac import BisimSAC
-from sb3_robust_bisim.cli.agents import add_agent_arguments, latest_run
+from sb3_robust_bisim.cli.agents import Agent, add_agent_arguments, chosen_agent
 from sb3_robust_bisim.cli.enjoy import record_episode, trained_run, trained_tasks
 from sb3_robust_bisim.cli.errors import UsageError
 from sb3_robust_bisim.cli.evaluate import DESCRIPTION, add_arguments, check_arguments, evaluate
@@ -209,10 +209,14 @@ def _enjoy(program: str, arguments: list[str]) -> None:
     parser.add_argument("--env", type=EnvironmentName, default=None, help="task")
     parser.add_argument("--video", type=Path, metavar="FILE", help="write one episode to an .mp4 or .gif, without a window")
     ours, theirs = _parse(parser, arguments)
-    if {"-h", "--help"} & set(arguments):  # rl-zoo3 prints the other half
-        ours = parser.parse_args([])
-    if ours.trained and (ours.algo != ALGO or ours.env is None or ours.env.gym_id not in trained_tasks()):
+    if {"-h", "--help"} & set(arguments):  # rl-zoo3 prints the other half, and exits
+        with _replaced(sys, "argv", [program, "--help"]):
+            rl_zoo3.enjoy.enjoy()
+    task = None if ours.env is None else ours.env.gym_id
+    if ours.trained and (ours.algo != ALGO or task not in trained_tasks()):
         parser.error(f"--trained: the package has agents of {ALGO} for --env {', '.join(trained_tasks())}, and no others.")
+    if task is None:
+        parser.error("--env: name the task, as in training.")
     video = None if ours.video is None else _video_arguments(program, arguments)
     with trained_run(ALGO, ours.env) if ours.trained else nullcontext(ours.folder) as found:
         if video is not None:
@@ -220,22 +224,24 @@ def _enjoy(program: str, arguments: list[str]) -> None:
             with _no_window():
                 print(record_episode(video))
             return
-        local = "rl-trained-agents" not in found  # rl-zoo3 downloads those
-        if ours.exp_id == 0 and ours.env is not None:
-            from_training = any(argument.startswith(("--load-checkpoint", "--load-last-checkpoint")) for argument in arguments)
-            ours.exp_id = latest_run(found, ours.algo, ours.env, "--load-best" in arguments, from_training)
-            if ours.exp_id == 0 and local:
-                parser.error(
-                    f"--folder {found}: no run of {ours.algo} on {ours.env.gym_id} has an agent. Pass the --folder and --algo "
-                    f"of one that has, or train it: robust-bisim train --env {ours.env.gym_id}. --trained plays an agent that "
-                    f"comes with the package, for {', '.join(trained_tasks())}."
-                )
-        run = Path(found, ours.algo, f"{ours.env}_{ours.exp_id}")
-        if local and ours.env is not None and ours.exp_id > 0 and not run.is_dir():
-            parser.error(f"--exp-id {ours.exp_id}: {found} has no such run of {ours.algo} on {ours.env.gym_id}.")
-        env = [] if ours.env is None else ["--env", ours.env.gym_id]
-        with _replaced(sys, "argv", [program, *theirs, "-f", found, "--exp-id", str(ours.exp_id), *env]):
+        exp_id = ours.exp_id
+        if "rl-trained-agents" not in found:  # rl-zoo3 downloads those
+            try:
+                exp_id = _agent_to_play(program, arguments, found).exp_id
+            except UsageError as error:
+                tasks = ", ".join(trained_tasks())
+                parser.error(f"{error}. --trained plays an agent that comes with the package, for {tasks}.")
+        with _replaced(sys, "argv", [program, *theirs, "-f", found, "--exp-id", str(exp_id), "--env", task]):
             rl_zoo3.enjoy.enjoy()
+
+
+def _agent_to_play(program: str, arguments: list[str], folder: str) -> Agent:
+    """The agent that `enjoy` is to play; rl-zoo3 would end with a traceback if there is none."""
+    parser = _parser(program)
+    add_agent_arguments(parser)
+    args, _ = parser.parse_known_args(arguments)
+    args.folder = folder
+    return chosen_agent(args)
 
 
 def _video_arguments(program: str, arguments: list[str]) -> argparse.Namespace:

@@ -129,7 +129,7 @@ FIGURES = {
             "self-prediction": Method(("self-prediction",), panels=("N_m=2", "N_m=3")),
             "self-prediction-IR": Method(("self-prediction",), {"intrinsic_reward_scale": 2.0}, ("N_m=2", "N_m=3")),
         },
-        *(5, 10_000, 500, 10, 17),
+        *(5, 10_000, 500, 10, 36),
         rows=ALL_ROWS,
     ),
     # what the README shows, from runs of the two figures beside it
@@ -140,11 +140,11 @@ FIGURES = {
             "DBC": Method(("DBC",), seeds=5),
             "SAC": Method(("SAC",), seeds=5),
         },
-        *(10, 10_000, 500, 10, 17),
+        *(10, 10_000, 500, 10, 36),
         solved=195.0,
     ),
     "metric": Figure(
-        _noisy(CARTPOLE, 2, 3), _with_and_without_metric(2.0), *(10, 10_000, 500, 10, 17), ALL_ROWS, solved=195.0
+        _noisy(CARTPOLE, 2, 3), _with_and_without_metric(2.0), *(10, 10_000, 500, 10, 36), ALL_ROWS, solved=195.0
     ),
     "metric_control": Figure(
         {
@@ -170,12 +170,12 @@ FIGURES = {
     "mountain_car": Figure(
         _noisy(MOUNTAIN_CAR, 1, 2),
         {**_variants("SAC", "DBC-IR", "DBC-normed", "normed-IR", "normed-IR-ID"), **_AS_WRITTEN},
-        *(5, 20_000, 1000, 10, 17),
+        *(5, 20_000, 1000, 10, 36),
         rows=ALL_ROWS,
         eval_envs=10,
     ),
-    "pendulum": Figure(_noisy(PENDULUM, 10), _variants("SAC", "DBC", "normed-IR-ID"), *(3, 30_000, 1000, 10, 17)),
-    "dbc_alt": Figure(_noisy(CARTPOLE, 0, 2), _variants("DBC", "DBC-alt"), *(5, 10_000, 500, 10, 17), rows=ALL_ROWS),
+    "pendulum": Figure(_noisy(PENDULUM, 10), _variants("SAC", "DBC", "normed-IR-ID"), *(3, 30_000, 1000, 10, 36)),
+    "dbc_alt": Figure(_noisy(CARTPOLE, 0, 2), _variants("DBC", "DBC-alt"), *(5, 10_000, 500, 10, 36), rows=ALL_ROWS),
     "theory": Figure(
         _noisy(CARTPOLE, 2),
         {
@@ -185,7 +185,7 @@ FIGURES = {
             "DBC-half-l2": Method(("DBC",), {**_HALF, "distance": "l2"}),
             "DBC-normed-half": Method(("DBC-normed",), _HALF),
         },
-        *(1, 4000, 500, 10, 17),
+        *(1, 4000, 500, 10, 36),
         rows=("embedding_norm_max", "mu_ratio"),
     ),
     "dmc_state": Figure(
@@ -224,6 +224,6 @@ FIGURES = {
     "bf16": Figure(
         _noisy(CARTPOLE, 2),
         {"fp32": Method(("normed-IR-ID",)), "bf16": Method(("normed-IR-ID",), {"bf16": True})},
-        *(2, 10_000, 500, 10, 17),
+        *(2, 10_000, 500, 10, 36),
     ),
 }

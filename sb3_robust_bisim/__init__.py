@@ -7,7 +7,7 @@ from sb3_robust_bisim.frame_buffer import FrameStackReplayBuffer
 from sb3_robust_bisim.intrinsic_reward import IntrinsicRewardVecEnv
 from sb3_robust_bisim.pretrained_encoder import PretrainedEncoder
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 __all__ = [
     "BisimSAC",
     "FrameStackReplayBuffer",

@@ -93,7 +93,7 @@ def check_task(env_id: str, config: str) -> None:
     if env_id not in tasks and "default" not in tasks:  # rl-zoo3 uses "default" for any task
         raise UsageError(
             f"--env {env_id}: {config} has settings for {', '.join(tasks)}. Copy the file, rename the entry of a similar "
-            "task in the copy, and pass the copy with -conf."
+            "task in the copy, set its reward_range, env_kwargs and eval_env_kwargs, and pass the copy with -conf."
         )
 
 

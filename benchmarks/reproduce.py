@@ -172,7 +172,7 @@ def train(command: list[str], folder: Path, result_path: Path, identity: dict, c
         if result := finished(result_path, identity):
             return result
         try:
-            measured = begin(folder, {**_machine.machine(), "commit": commit})
+            measured = begin(folder, {**_machine.machine(command[command.index("--device") + 1]), "commit": commit})
             stopped = learn(command, folder)
             result = {**identity, **measured, **stopped, **collect(folder)}
             if not stopped and steps_of(result)[-1] + identity["eval_freq"] <= identity["steps"]:

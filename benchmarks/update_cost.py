@@ -46,7 +46,7 @@ BATCH = {"mlp": 512, "cnn": 128}
 SCHEDULE = {"paper": dict(policy_delay=2, target_update_interval=2), "sac": dict(policy_delay=1)}
 FULL = dict(intrinsic_reward_scale=2.0, inverse_dynamics_coef=1.0)
 # bf16 without its instructions is emulated, and many times slower
-PRECISIONS = (False, True) if th.ops.mkldnn._is_mkldnn_bf16_supported() else (False,)
+PRECISIONS = (False, True) if getattr(th.ops.mkldnn, "_is_mkldnn_bf16_supported", bool)() else (False,)
 CPU = dict(device="cpu", seed=0)  # as the floor
 OFF = dict(bisim_coef=0.0, norm_constraint=False)
 CARTPOLE = "robust_bisim/SparseCartPole-v0"

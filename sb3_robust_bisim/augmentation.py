@@ -20,8 +20,23 @@ def random_shift(images: th.Tensor, pad: int) -> th.Tensor:
     padded[:, :, pad : pad + height, pad + width :] = images[..., -1:]
     padded[:, :, :pad] = padded[:, :, pad : pad + 1]
     padded[:, :, pad + height :] = padded[:, :, pad + height - 1 : pad + height]
-    shifted = th.empty_like(images)
-    # one block copy per sample: much faster than indexing pixel by pixel
-    for i, (top, left) in enumerate(th.randint(2 * pad + 1, (n, 2)).tolist()):
-        shifted[i] = padded[i, :, top : top + height, left : left + width]
-    return shifted
+    offsets = th.randint(2 * pad + 1, (n, 2))
+    windows = _windows_by_index if images.is_cuda else _windows_by_copy
+    return windows(padded, offsets, height, width)
+
+
+def _windows_by_copy(padded: th.Tensor, offsets: th.Tensor, height: int, width: int) -> th.Tensor:
+    """One block copy per image: on a CPU much faster than indexing pixel by pixel."""
+    windows = padded.new_empty(*padded.shape[:2], height, width)
+    for i, (top, left) in enumerate(offsets.tolist()):
+        windows[i] = padded[i, :, top : top + height, left : left + width]
+    return windows
+
+
+def _windows_by_index(padded: th.Tensor, offsets: th.Tensor, height: int, width: int) -> th.Tensor:
+    """One operation for all images, because a GPU would start each copy by itself."""
+    images = th.arange(len(padded))[:, None, None]
+    rows = offsets[:, :1] + th.arange(height)
+    columns = offsets[:, 1:] + th.arange(width)
+    indices = (index.to(padded.device, non_blocking=True) for index in (images, rows[:, :, None], columns[:, None, :]))
+    return padded.movedim(1, -1)[tuple(indices)].movedim(-1, 1).contiguous()

@@ -134,6 +134,8 @@ class BisimSAC(Interruptible, SAC):
         self.policy_kwargs = {**policy_kwargs, "objective": objective, "bf16": self.bf16, "random_shift": self.random_shift}
         super()._setup_model()
         self.policy_kwargs = policy_kwargs
+        if self.use_sde and self.device.type != "cpu":  # SB3 draws the first noise before it moves the policy
+            self.policy.reset_noise()
 
     @property
     def radius(self) -> float | None:

@@ -34,11 +34,14 @@ def check_arguments(model: Any) -> None:
     _require(_is_number(model.gamma) and 0 <= model.gamma <= 1, model, "gamma", "in [0, 1]")
     _require(_is_number(model.tau) and 0 <= model.tau <= 1, model, "tau", "in [0, 1]")
     _check_train_freq(model)
-    if model.bf16 and model.device.type == "cpu" and not getattr(th.ops.mkldnn, "_is_mkldnn_bf16_supported", bool)():
-        warnings.warn("bf16=True: this CPU has no bfloat16 instructions, so fp32 is several times faster.", stacklevel=4)
+    _check_entropy(model)
+    _check_learning_rate(model)
+    _warn_of_emulation(model)
     _check_random_shift(model.random_shift, model.observation_space)
     n_steps = model.n_steps if model.n_steps != 1 else model.replay_buffer_kwargs.get("n_steps", 1)
     buffer_class = model.replay_buffer_class
+    is_class = buffer_class is None or isinstance(buffer_class, type)
+    _require(is_class, model, "replay_buffer_class", "a class, such as stable_baselines3.HerReplayBuffer, or None")
     if n_steps != 1 or (buffer_class is not None and issubclass(buffer_class, NStepReplayBuffer)):
         raise ValueError(
             f"n_steps={n_steps} (replay_buffer_class={buffer_class}): dynamics, inverse dynamics and metric are about one "
@@ -66,6 +69,36 @@ def check_arguments(model: Any) -> None:
         raise ValueError(f"policy={model.policy_class!r}: it must be a subclass of sb3_robust_bisim.policies.BisimPolicy.")
     if "features_extractor_class" not in model.policy_kwargs:
         _check_policy_fits(model)
+
+
+def _check_entropy(model: Any) -> None:
+    auto, _, start = model.ent_coef.partition("_") if isinstance(model.ent_coef, str) else ("", "", "")
+    try:
+        automatic = auto == "auto" and 0 < float(start or 1) < np.inf
+    except ValueError:
+        automatic = False
+    remedy = 'a number >= 0, "auto", or "auto_" and a start above 0, such as "auto_0.1"'
+    _require(automatic or (_is_number(model.ent_coef) and model.ent_coef >= 0), model, "ent_coef", remedy)
+    automatic = isinstance(model.target_entropy, str) and model.target_entropy == "auto"
+    _require(automatic or _is_number(model.target_entropy), model, "target_entropy", 'a number or "auto"')
+
+
+def _check_learning_rate(model: Any) -> None:
+    value = model.learning_rate
+    now = value(1.0) if callable(value) else value  # a schedule's argument is the share of the training that remains
+    _require(_is_number(now) and now >= 0, model, "learning_rate", "a number >= 0, or a function that returns one")
+
+
+def _warn_of_emulation(model: Any) -> None:
+    if not model.bf16:
+        return
+    if model.device.type == "cpu":
+        fast = getattr(th.ops.mkldnn, "_is_mkldnn_bf16_supported", bool)()
+    else:
+        fast = model.device.type != "cuda" or th.cuda.is_bf16_supported(including_emulation=False)
+    if not fast:
+        unit = model.device.type.upper().replace("CUDA", "GPU")
+        warnings.warn(f"bf16=True: this {unit} has no bfloat16 instructions, so fp32 is several times faster.", stacklevel=5)
 
 
 def _check_train_freq(model: Any) -> None:
@@ -128,7 +161,7 @@ def _is_whole(value: Any, least: int) -> bool:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+    return isinstance(value, (int, float, np.number)) and not isinstance(value, bool) and bool(np.isfinite(value))
 
 
 def _require(condition: Any, model: Any, name: str, remedy: str) -> None:

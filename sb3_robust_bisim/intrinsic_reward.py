@@ -123,7 +123,7 @@ def with_intrinsic_reward(env: VecEnv, observation_space: spaces.Space, scale: f
         raise ValueError(
             f"VecNormalize inside of {type(env).__name__}, which changes the shape of observations: SB3 would store them as "
             "VecNormalize sees them. Make VecNormalize the outermost of both; for images with the channels last, use "
-            "VecNormalize(VecTransposeImage(venv), ...)."
+            "VecNormalize(VecTransposeImage(venv), norm_obs=False, norm_reward=False)."
         )
     if wrapper is not None and normalize is not None and chain.index(wrapper) < chain.index(normalize):
         raise ValueError(f"IntrinsicRewardVecEnv outside of VecNormalize: its rewards would be ignored; {remedy}")

@@ -116,7 +116,8 @@ class BisimPolicy(SACPolicy):
         obs, next_obs = (Encoded(encoder.preprocess(o)) for o in observations)
         z = obs[encoder]
         metric = self.objective.metric
-        with th.set_grad_enabled(self.objective.inverse_dynamics_coef > 0 or metric.absorbing):
+        absorbing = metric.absorbing and self.objective.bisim_coef > 0
+        with th.set_grad_enabled(self.objective.inverse_dynamics_coef > 0 or absorbing):
             next_z = next_obs[encoder]
         with th.no_grad():
             target_next_z = next_obs[target_encoder]

@@ -76,6 +76,7 @@ class PretrainedEncoder(BaseFeaturesExtractor):
         self.encoder = Encoder(extractor, observation_space, **settings)
         self.freeze = freeze
         self.images = images
+        self._scale_seen = False
         self.requires_grad_(not freeze)
         self.train(self.training)
 
@@ -91,15 +92,16 @@ class PretrainedEncoder(BaseFeaturesExtractor):
         """
         :param observations: as SB3's policies pass them on, images divided by 255; or as environments give them
         :return: z inside the ball, (B, n)
-        :raises ValueError: for images of floats above 1
+        :raises ValueError: for images of floats above 1, in the first batch: later ones would wait for the device in vain
         """
         tensors = _parts(observations)
         with th.set_grad_enabled(th.is_grad_enabled() and not self.freeze):
             if not all(tensor.is_floating_point() for tensor in tensors.values()):
                 return self.encoder.encode(observations)
-            for key in self.images:
+            for key in () if self._scale_seen else self.images:
                 if (largest := float(tensors[key].max())) > 1:
                     raise ValueError(f"observations: pixels up to {largest}, not in [0, 1]. Use normalize_images=True.")
+            self._scale_seen = True
             return self.encoder(observations)
 
 

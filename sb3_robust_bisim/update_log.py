@@ -30,7 +30,7 @@ class UpdateLog:
         :return: by TensorBoard key the mean over the updates that gave a value
         :raises ValueError: if one of the numbers is not finite
         """
-        values = iter(th.stack([value for steps in self._scalars.values() for _, value in steps]).cpu().tolist())
+        values = iter(th.stack([value for steps in self._scalars.values() for _, value in steps]).tolist())
         numbers = {name: [(update, next(values)) for update, _ in steps] for name, steps in self._scalars.items()}
         broken = [
             (update, name, value) for name, steps in numbers.items() for update, value in steps if not np.isfinite(value)

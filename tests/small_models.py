@@ -5,8 +5,10 @@ from typing import Any
 
 import gymnasium as gym
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
@@ -31,6 +33,18 @@ class StopAt(BaseCallback):
         if self.num_timesteps >= self.step and self.error is not None:
             raise self.error
         return self.num_timesteps < self.step
+
+
+class NormDropout(BaseFeaturesExtractor):
+    """An encoder that behaves differently in training."""
+
+    def __init__(self, observation_space: spaces.Box) -> None:
+        super().__init__(observation_space, observation_space.shape[0])
+        self.norm = nn.BatchNorm1d(observation_space.shape[0])
+        self.net = nn.Sequential(nn.Flatten(), self.norm, nn.Dropout(0.5))
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.net(observations)
 
 
 def pendulum(reward: float | None = None) -> gym.Env:

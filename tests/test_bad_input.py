@@ -45,6 +45,11 @@ OUT_OF_RANGE: list[tuple[str, Any]] = [
     ),
     *(("tau", value) for value in (-0.1, 1.1, NAN, None)),
     *(("bf16", value) for value in (1, None)),
+    *(("ent_coef", value) for value in ("foo", "auto_0", "auto_x", "auto_nan", -1.0, NAN, None)),
+    *(("target_entropy", value) for value in ("foo", NAN, None)),
+    *(("learning_rate", value) for value in (-1.0, NAN, "x", None)),
+    ("learning_starts", INF),
+    ("replay_buffer_class", "ReplayBuffer"),
 ]
 
 

@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 from sb3_robust_bisim import BisimSAC
 from sb3_robust_bisim.callbacks import DenoisingFactorCallback, EmbeddingCallback, ValueBoundCallback, diagnostic
 from sb3_robust_bisim.callbacks.denoising import denoising_factor
+from sb3_robust_bisim.callbacks.embedding import _pca_figure
 from sb3_robust_bisim.cli import zoo
 from sb3_robust_bisim.envs import NoiseObservation
 from sb3_robust_bisim.runs.checkpoint import Checkpoint, load_checkpoint
@@ -271,6 +272,19 @@ def test_from_pixels_all_looks_show_the_same_robot_in_front_of_different_backgro
     assert (backgrounds == backgrounds[:, :, :1]).all()  # a colour stays for a whole episode, and so for a stack
     assert len(np.unique(backgrounds[:, 0, 0, :, 0, 0], axis=0)) == 4
     assert len(np.unique(robot[0], axis=0)) > 1
+
+
+def test_measuring_once_closes_both_environments() -> None:
+    model = learn(None, None, steps=12)
+    callback = DenoisingFactorCallback(n_states=6, n_positives=3, eval_env_kwargs=dict(noise_mean=1.0))
+    callback.factor_of(model)
+    assert callback._venv is None
+    assert callback._held_out is not None
+    assert callback._held_out._venv is None
+
+
+def test_an_embedding_of_one_number_is_drawn() -> None:
+    assert _pca_figure(th.randn(10, 1), th.randn(10, 1)).figure.axes
 
 
 def test_no_held_out_number_is_recorded_unless_asked_for(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch as th
 import yaml
-from small_models import StopAt, logged_steps, make_model, pendulum
+from small_models import NormDropout, StopAt, logged_steps, make_model, pendulum
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.env_util import make_vec_env
@@ -49,6 +49,9 @@ def pixel_task() -> VecEnv:
 def model_of(task: str) -> BisimSAC:
     if task == "state":
         return make_model("MlpPolicy", state_task(), **LEARNING)
+    if task == "batch norm":
+        policy_kwargs = dict(net_arch=[16], features_extractor_class=NormDropout, share_features_extractor=False)
+        return make_model("MlpPolicy", state_task(), **LEARNING, policy_kwargs=policy_kwargs)
     return make_model("CnnPolicy", pixel_task(), replay_buffer_class=FrameStackReplayBuffer, **LEARNING)
 
 
@@ -63,7 +66,7 @@ def assert_equal_weights(model: BisimSAC, expected: BisimSAC) -> None:
         assert th.equal(tensor, model.policy.state_dict()[name]), name
 
 
-@pytest.mark.parametrize("task", ["state", "pixels"])
+@pytest.mark.parametrize("task", ["state", "batch norm", "pixels"])
 def test_resumed_training_equals_uninterrupted_training(task: str, tmp_path: Path) -> None:
     expected = model_of(task).learn(STEPS)
 
@@ -290,6 +293,12 @@ def test_other_versions_continue_in_new_episodes(task: str, tmp_path: Path, monk
     assert continued.learn(20, reset_num_timesteps=False).num_timesteps == 80
 
 
+def test_new_episodes_in_another_number_of_environments_are_refused(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "checkpoint.pkl", make_model(**LEARNING))
+    with pytest.raises(ValueError, match=r"env with num_envs=2: the checkpoint has a replay buffer for 1 environments. Pass"):
+        load_checkpoint(tmp_path / "checkpoint.pkl", env=make_vec_env("Pendulum-v1", 2))
+
+
 def test_resumed_training_with_hindsight_replay_equals_uninterrupted_training(tmp_path: Path) -> None:
     expected = hindsight_model().learn(60)
     hindsight_model().learn(60, callback=CallbackList([Checkpoint(tmp_path / "checkpoint.pkl", 30), StopAt(40)]))
@@ -344,9 +353,10 @@ def test_two_writers_of_one_file_do_not_mix(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_an_interval_of_no_steps_between_checkpoints_is_refused() -> None:
-    with pytest.raises(ValueError, match="every=0"):
-        Checkpoint("checkpoint.pkl", 0)
+@pytest.mark.parametrize("every", [0, 2.5])
+def test_an_interval_that_is_no_number_of_steps_is_refused(every: Any) -> None:
+    with pytest.raises(ValueError, match=f"every={every}: it must be an integer >= 1"):
+        Checkpoint("checkpoint.pkl", every)
 
 
 @pytest.fixture

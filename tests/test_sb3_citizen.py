@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from small_models import EPISODE, StopAt, dicts, images, make_model, parameters, pendulum, with_data
+from small_models import EPISODE, NormDropout, StopAt, dicts, images, make_model, parameters, pendulum, with_data
 from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     SubprocVecEnv,
@@ -253,18 +252,6 @@ def test_hindsight_replay_ends_the_episode_that_a_callback_has_cut_off() -> None
     buffer = model.replay_buffer
     assert buffer.dones[2]  # of the transitions 0 to 2, which were stored
     assert buffer.ep_start[2] + buffer.ep_length[2] == 3
-
-
-class NormDropout(BaseFeaturesExtractor):
-    """An encoder that behaves differently in training."""
-
-    def __init__(self, observation_space: spaces.Box) -> None:
-        super().__init__(observation_space, observation_space.shape[0])
-        self.norm = nn.BatchNorm1d(observation_space.shape[0])
-        self.net = nn.Sequential(nn.Flatten(), self.norm, nn.Dropout(0.5))
-
-    def forward(self, observations: th.Tensor) -> th.Tensor:
-        return self.net(observations)
 
 
 @pytest.mark.parametrize("share", [True, False])

@@ -17,6 +17,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from sb3_robust_bisim.encoders import Encoder, PixelEncoder
 from sb3_robust_bisim.update_log import unchecked_distributions
 
+DYNAMICS = ("deterministic", "probabilistic")  # an ensemble draws its member on the CPU, which counts as a wait and is none
+MICO = dict(successors="sample", target_encoder="both", loss="huber", pairs="all")
+
 
 class Reads(TorchDispatchMode):
     """Counts operations that wait for a value, even inside PyTorch, such as `.item()` and `bool(tensor)`."""
@@ -35,6 +38,9 @@ class Reads(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
+TRANSFERS = (th.Tensor.cpu, th.Tensor.numpy, th.Tensor.tolist, np.asarray)
+
+
 class Transfers(TorchFunctionMode):
     """Counts transfers of whole tensors to the host. A tensor on the CPU does not dispatch them."""
 
@@ -43,22 +49,30 @@ class Transfers(TorchFunctionMode):
         self.count = 0
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        self.count += func in (th.Tensor.cpu, th.Tensor.numpy)
+        self.count += func in (th.Tensor.cpu, th.Tensor.numpy, th.Tensor.tolist, th.Tensor.__array__)
         return func(*args, **(kwargs or {}))
 
 
-@pytest.mark.parametrize("dynamics", ["deterministic", "probabilistic"])
-@pytest.mark.parametrize("use_sde", [False, True])
-def test_no_gradient_step_waits_for_the_device(dynamics: str, use_sde: bool) -> None:
+SETTINGS: list[dict[str, Any]] = [
+    *(dict(dynamics=dynamics, use_sde=use_sde) for dynamics in DYNAMICS for use_sde in (False, True)),
+    dict(policy="CnnPolicy", env=images()),
+    dict(metric_kwargs=dict(absorbing=True)),
+    dict(distance="mico", norm_constraint=False, metric_kwargs=MICO),
+    dict(distance="rap", dynamics="probabilistic", metric_kwargs=dict(loss="variance_corrected")),
+]
+
+
+@pytest.mark.parametrize("settings", SETTINGS, ids=lambda settings: ", ".join(map(str, settings)))
+def test_no_gradient_step_waits_for_the_device(settings: dict[str, Any]) -> None:
     # the entropy coefficient is fixed because Adam's default form reads its step counts on the CPU
-    model = with_data(ent_coef=0.1, dynamics=dynamics, use_sde=use_sde)
+    model = with_data(ent_coef=0.1, **settings)
     with Reads() as reads, Transfers() as transfers:
         model.train(gradient_steps=6, batch_size=8)
     assert reads.count == 0
     assert transfers.count == 1  # one transfer of all logged values at the end
 
 
-@pytest.mark.parametrize("wait", [th.Tensor.item, bool, th.nonzero, lambda x: x[x > 0], th.Tensor.cpu, th.Tensor.numpy])
+@pytest.mark.parametrize("wait", [th.Tensor.item, bool, th.nonzero, lambda x: x[x > 0], *TRANSFERS])
 def test_every_way_of_waiting_is_counted(wait: Callable[[th.Tensor], Any]) -> None:
     with Reads() as reads, Transfers() as transfers:
         wait(th.ones(1))

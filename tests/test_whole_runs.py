@@ -4,6 +4,7 @@ The suite tries few combinations, always the same ones. WHOLE_RUNS=300 tries so 
 """
 
 import os
+import re
 import tempfile
 from functools import partial
 from pathlib import Path
@@ -164,10 +165,17 @@ def test_a_run_is_refused_at_once_or_works_to_the_end(
 ) -> None:
     metric, metric_kwargs = family
     own = {"metric_kwargs": metric_kwargs, "policy_kwargs": dict(net_arch=[16], **policy)}
+    built = {**kwargs, **risky, **metric, **own}
+    refusal = None
     try:
-        model = build(kind, n_envs, n_actions, chain, frames and "channels" in kind, {**kwargs, **risky, **metric, **own})
+        model = build(kind, n_envs, n_actions, chain, frames and "channels" in kind, built)
     except ValueError as error:
-        event(f"refused: {str(error)[:60]}")
+        refusal = str(error)
+    if refusal is not None:
+        event(f"refused: {refusal[:60]}")
+        assert re.search(r"\w=|VecNormalize|IntrinsicRewardVecEnv|FrameStackReplayBuffer", refusal), (
+            "it does not name what is wrong"
+        )
         return
     event("trained")
     learn(model)

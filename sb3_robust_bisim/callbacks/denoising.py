@@ -111,10 +111,10 @@ class DenoisingFactorCallback(EnvironmentCallback):
             self._held_out.model = self.model
             self._held_out._prepare()
 
-    def _on_training_end(self) -> None:
-        super()._on_training_end()
+    def _close(self) -> None:
+        super()._close()
         if self._held_out is not None:
-            self._held_out._on_training_end()
+            self._held_out._close()
 
     def _measure(self) -> None:
         self.logger.record("bisim/denoising_factor", self._factor())

@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch as th
+import torch.nn.functional as F
 from matplotlib.figure import Figure
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.logger import TensorBoardOutputFormat
@@ -78,6 +79,7 @@ def _pca_figure(z: th.Tensor, values: th.Tensor) -> Figure:
     :param values: (B, 1)
     """
     centred = (z - z.mean(dim=0)).cpu().double()
+    centred = F.pad(centred, (0, max(0, 2 - z.shape[1])))  # an embedding of one number has no second component
     _, singular, directions = th.linalg.svd(centred, full_matrices=False)
     plane = centred @ directions[:2].T
     share = singular.square() / singular.square().sum().clamp(min=1e-30)

@@ -23,6 +23,7 @@ import torch as th
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.utils import get_parameters_by_name
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_robust_bisim.runs.hashed_file import damage, opened, previous, replaced
@@ -37,14 +38,14 @@ class Checkpoint(BaseCallback):
     :param every: environment steps between two checkpoints, summed over all environments, >= 1
     :param context: other objects to save in the same file. Objects that they share with the model stay shared
     :param about: plain values that :func:`read_about` returns without unpickling the rest
-    :raises ValueError: for ``every`` < 1; at the start of training, for environments that cannot be saved (see
-        :func:`save_checkpoint`)
+    :raises ValueError: unless ``every`` is an integer >= 1; at the start of training, for environments that cannot be saved
+        (see :func:`save_checkpoint`)
     """
 
     def __init__(self, path: str | Path, every: int, context: Any = None, about: dict[str, Any] | None = None) -> None:
         super().__init__()
-        if every < 1:
-            raise ValueError(f"every={every}: must be at least 1.")
+        if not isinstance(every, int) or every < 1:
+            raise ValueError(f"every={every!r}: it must be an integer >= 1, the environment steps between two checkpoints.")
         self.path = Path(path)
         self.every = every
         self.context = context
@@ -134,7 +135,7 @@ def load_checkpoint(path: str | Path, env: VecEnv | None = None) -> tuple[Any, A
         statistics of ``VecNormalize`` are loaded, and new episodes begin. The context and the random generators are not loaded
     :return: the model with its environments and its replay buffer, and the context (None with ``env``)
     :raises ValueError: if the file is not a checkpoint or damaged; without ``env``, if it was written with other package
-        versions or with more GPUs
+        versions or with more GPUs; with an ``env`` of another number of environments
     """
     path = _intact(Path(path))
     with opened(path) as file:
@@ -149,6 +150,7 @@ def load_checkpoint(path: str | Path, env: VecEnv | None = None) -> tuple[Any, A
             return _with_new_episodes(parts, env), None
         model, context, generators, rollout_begun = unpickler.load()
     model._custom_logger = False  # so that learn() creates a logger
+    _link_batch_norm(model)
     if isinstance(getattr(model, "replay_buffer", None), HerReplayBuffer):  # it does not pickle its environment
         model.replay_buffer.set_env(model.env)
     if rollout_begun and model.use_sde:
@@ -208,6 +210,11 @@ def _without_environment(model: BaseAlgorithm) -> tuple[Any, ...]:
 
 def _with_new_episodes(parts: tuple[Any, ...], env: VecEnv) -> BaseAlgorithm:
     algorithm, agent, device, replay_buffer, statistics = parts
+    if replay_buffer is not None and replay_buffer.n_envs != env.num_envs:
+        raise ValueError(
+            f"env with num_envs={env.num_envs}: the checkpoint has a replay buffer for {replay_buffer.n_envs} environments. "
+            "Pass as many."
+        )
     model = algorithm.load(io.BytesIO(agent), env=env, device=device)
     if replay_buffer is not None:
         model.replay_buffer, replay_buffer.device = replay_buffer, model.device
@@ -217,6 +224,15 @@ def _with_new_episodes(parts: tuple[Any, ...], env: VecEnv) -> BaseAlgorithm:
     if statistics is not None and (normalize := model.get_vec_normalize_env()) is not None:
         normalize.obs_rms, normalize.ret_rms = statistics
     return model
+
+
+def _link_batch_norm(model: BaseAlgorithm) -> None:
+    """Let SB3's lists of BatchNorm statistics be those of the nets again: pickle makes copies of tensors that share memory."""
+    for name in [name for name in vars(model) if name.removesuffix("_target").endswith("batch_norm_stats")]:
+        target = "_target" if name.endswith("_target") else ""
+        owner = name.removesuffix("_target").removesuffix("batch_norm_stats").rstrip("_")  # TD3 has those of its actor, too
+        net = owner or ("critic" if hasattr(model, "critic") else "q_net")
+        setattr(model, name, get_parameters_by_name(getattr(model, net + target), ["running_"]))
 
 
 def _skip_next(obj: Any, method: str) -> None:

@@ -91,8 +91,9 @@ def check_environments(env: VecEnv | gym.Env) -> None:
 
 
 def generator_states(device: th.device) -> tuple[Any, ...]:
-    """The states of the process' random generators, and of all GPUs if the device is one."""
-    cuda = th.cuda.get_rng_state_all() if device.type == "cuda" else []
+    """The states of the process' random generators; if the device is a GPU also of all GPUs, and the settings of cuDNN."""
+    cudnn = th.backends.cudnn
+    cuda = (th.cuda.get_rng_state_all(), cudnn.deterministic, cudnn.benchmark) if device.type == "cuda" else ()
     return random.getstate(), np.random.get_state(), th.get_rng_state(), cuda  # noqa: NPY002 (SB3 samples with it)
 
 
@@ -103,7 +104,8 @@ def restore_generators(states: tuple[Any, ...]) -> None:
     np.random.set_state(numpy)  # noqa: NPY002
     th.set_rng_state(torch)
     if cuda:
-        th.cuda.set_rng_state_all(cuda)
+        gpus, th.backends.cudnn.deterministic, th.backends.cudnn.benchmark = cuda
+        th.cuda.set_rng_state_all(gpus)
 
 
 class ResumableSubprocVecEnv(SubprocVecEnv):

@@ -38,7 +38,7 @@ TARGETS = {"growth_at_most_mb_per_10000_steps": 1.0, "speed_at_least_of_middle":
 # Small buffers, so that they are full early; evaluations and checkpoints often
 COMMON = ["--verbose", "0", "--log-interval", "1", "--seed", "0", "--num-threads", "1", "--n-timesteps", "100000000"]
 RUNS: dict[str, tuple[int, list[str]]] = {
-    "cartpole": (*(2000, ["--env", "robust_bisim/SparseCartPole-v0", "--eval-freq", "2000", "--checkpoint-freq", "1000"]),),
+    "cartpole": (2000, ["--env", "robust_bisim/SparseCartPole-v0", "--eval-freq", "2000", "--checkpoint-freq", "1000"]),
     "pixels": (
         2000,
         [

@@ -45,6 +45,7 @@ METHODS = {  # in the figures: in the table
     "normed-IR-ID-no-metric": "full without metric",
     "self-prediction": "self-prediction",
     "self-prediction-shift": "self-prediction with random shift",
+    "self-prediction-metric": "self-prediction with random shift and metric",
     "self-prediction-IR": "self-prediction with bonus",
     "full-MICo": "full with MICo's metric",
     "full-SimSR": "full with SimSR's metric",

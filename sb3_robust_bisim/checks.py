@@ -184,7 +184,7 @@ def check_names(algorithm: type, kwargs: dict[str, Any], also: Iterable[str] = (
             raise TypeError(f"BisimSAC has no argument {name!r} (value {kwargs[name]!r}){closest(name, known)}")
 
 
-def closest(name: str, known: Iterable[str]) -> str:
+def closest(name: str, known: Iterable[str], otherwise: str = ": see the documentation of BisimSAC and SAC.") -> str:
     """The end of a message about a name that is not known."""
     matches = difflib.get_close_matches(name, known, n=1)
-    return f", did you mean {matches[0]!r}?" if matches else ": see the documentation of BisimSAC and SAC."
+    return f", did you mean {matches[0]!r}?" if matches else otherwise

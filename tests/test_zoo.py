@@ -223,6 +223,20 @@ def test_the_error_for_a_task_without_settings_lists_the_tasks_with_settings(zoo
 
 
 @pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "--env None: name a registered task. If your package registers it, add --gym-packages"),
+        (["--env", "robust_bisim/SparseCartpole-v0"], f"name a registered task, did you mean '{CARTPOLE}'? If your"),
+        (["--env", "x"], "--env x: name a registered task. If your"),
+    ],
+)
+def test_a_task_that_does_not_exist_is_refused_with_the_closest_one(zoo: Zoo, arguments: list[str], message: str) -> None:
+    with pytest.raises(SystemExit):
+        zoo("train", *arguments)
+    assert message in zoo.output
+
+
+@pytest.mark.parametrize(
     ("file", "message"), [("", "this is a folder"), ("a file/run.pkl", "name a file in a folder with write access")]
 )
 def test_a_checkpoint_that_could_not_be_written_is_refused_at_once(zoo: Zoo, file: str, message: str, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import rl_zoo3.enjoy
 import rl_zoo3.train
 import torch as th
@@ -21,6 +22,7 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, 
 from rl_zoo3.utils import EnvironmentName
 
 from sb3_robust_bisim.bisim_sac import BisimSAC
+from sb3_robust_bisim.checks import closest
 from sb3_robust_bisim.cli.agents import Agent, add_agent_arguments, chosen_agent
 from sb3_robust_bisim.cli.enjoy import record_episode, trained_run, trained_tasks
 from sb3_robust_bisim.cli.errors import UsageError
@@ -140,6 +142,7 @@ def _sigterm_as_ctrl_c() -> Iterator[None]:
 def _train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, list[str]]:
     """Split the arguments of `train` into the options that rl-zoo3 does not have, and rl-zoo3's with our defaults."""
     parser = _parser(program)
+    parser.add_argument("--env", help="task, for example robust_bisim/SparseCartPole-v0")
     parser.add_argument(
         *("--variant", "--variants"),
         dest="variants",
@@ -175,6 +178,11 @@ def _train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, li
     parser.add_argument("--seed", type=int, help="seed of environments, networks and sampling (default: a random one)")
     parser.add_argument("-conf", "--conf-file", help=f"file with hyperparameters (default for {ALGO}: {DEFAULT_CONFIG})")
     ours, theirs = _parse(parser, arguments)
+    if ours.env is not None:
+        theirs += ["--env", ours.env]
+    if ours.env not in gym.registry and not {"-h", "--help", "--gym-packages"} & set(arguments):
+        known = "." if ours.env is None else closest(ours.env, gym.registry, ".")
+        parser.error(f"--env {ours.env}: name a registered task{known} If your package registers it, add --gym-packages.")
     if ours.checkpoint_freq < 1:
         parser.error(f"--checkpoint-freq {ours.checkpoint_freq}: must be at least 1.")
     if ours.n_timesteps is not None and ours.n_timesteps < 1:  # rl-zoo3 would take the config file's

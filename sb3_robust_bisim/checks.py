@@ -72,21 +72,27 @@ def check_arguments(model: Any) -> None:
 
 
 def _check_entropy(model: Any) -> None:
-    auto, _, start = model.ent_coef.partition("_") if isinstance(model.ent_coef, str) else ("", "", "")
-    try:
-        automatic = auto == "auto" and 0 < float(start or 1) < np.inf
-    except ValueError:
-        automatic = False
+    auto, separator, start = model.ent_coef.partition("_") if isinstance(model.ent_coef, str) else ("", "", "")
+    automatic = auto == "auto" and (not separator or _finite(start) > 0)
     remedy = 'a number >= 0, "auto", or "auto_" and a start above 0, such as "auto_0.1"'
-    _require(automatic or (_is_number(model.ent_coef) and model.ent_coef >= 0), model, "ent_coef", remedy)
+    _require(automatic or _finite(model.ent_coef) >= 0, model, "ent_coef", remedy)
     automatic = isinstance(model.target_entropy, str) and model.target_entropy == "auto"
-    _require(automatic or _is_number(model.target_entropy), model, "target_entropy", 'a number or "auto"')
+    _require(automatic or _finite(model.target_entropy) > -np.inf, model, "target_entropy", 'a number or "auto"')
 
 
 def _check_learning_rate(model: Any) -> None:
     value = model.learning_rate
-    now = value(1.0) if callable(value) else value  # a schedule's argument is the share of the training that remains
-    _require(_is_number(now) and now >= 0, model, "learning_rate", "a number >= 0, or a function that returns one")
+    now = value(1.0) if callable(value) else value if isinstance(value, (int, float)) else None  # SB3 takes no others
+    _require(_finite(now) >= 0, model, "learning_rate", "a number >= 0, or a function that returns one")
+
+
+def _finite(value: Any) -> float:
+    """What ``float`` makes of a value, as SB3 does; minus infinity for what is no finite number."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        return -np.inf
+    return number if np.isfinite(number) else -np.inf
 
 
 def _warn_of_emulation(model: Any) -> None:
@@ -161,7 +167,7 @@ def _is_whole(value: Any, least: int) -> bool:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float, np.number)) and not isinstance(value, bool) and bool(np.isfinite(value))
+    return isinstance(value, (int, float, np.number)) and not isinstance(value, bool) and _finite(value) > -np.inf
 
 
 def _require(condition: Any, model: Any, name: str, remedy: str) -> None:

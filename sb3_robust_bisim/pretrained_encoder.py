@@ -92,17 +92,22 @@ class PretrainedEncoder(BaseFeaturesExtractor):
         """
         :param observations: as SB3's policies pass them on, images divided by 255; or as environments give them
         :return: z inside the ball, (B, n)
-        :raises ValueError: for images of floats above 1, in the first batch: later ones would wait for the device in vain
+        :raises ValueError: for images of floats above 1 in the first batch that is not black
         """
         tensors = _parts(observations)
         with th.set_grad_enabled(th.is_grad_enabled() and not self.freeze):
             if not all(tensor.is_floating_point() for tensor in tensors.values()):
                 return self.encoder.encode(observations)
-            for key in () if self._scale_seen else self.images:
-                if (largest := float(tensors[key].max())) > 1:
-                    raise ValueError(f"observations: pixels up to {largest}, not in [0, 1]. Use normalize_images=True.")
-            self._scale_seen = True
+            if not self._scale_seen:
+                self._check_scale([tensors[key] for key in self.images])
             return self.encoder(observations)
+
+    def _check_scale(self, images: list[th.Tensor]) -> None:
+        """Until a batch is not black, because each look at the values waits for the device."""
+        largest = max((float(image.max()) for image in images), default=1.0)
+        if largest > 1:
+            raise ValueError(f"observations: pixels up to {largest}, not in [0, 1]. Use normalize_images=True.")
+        self._scale_seen = largest > 0
 
 
 def _parts(whole: Any) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
@@ -45,7 +46,7 @@ OUT_OF_RANGE: list[tuple[str, Any]] = [
     ),
     *(("tau", value) for value in (-0.1, 1.1, NAN, None)),
     *(("bf16", value) for value in (1, None)),
-    *(("ent_coef", value) for value in ("foo", "auto_0", "auto_x", "auto_nan", -1.0, NAN, None)),
+    *(("ent_coef", value) for value in ("foo", "auto_", "auto_0", "auto_x", "auto_nan", -1.0, NAN, None)),
     *(("target_entropy", value) for value in ("foo", NAN, None)),
     *(("learning_rate", value) for value in (-1.0, NAN, "x", None)),
     ("learning_starts", INF),
@@ -57,6 +58,19 @@ OUT_OF_RANGE: list[tuple[str, Any]] = [
 def test_a_value_out_of_range_is_refused_by_name(name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=re.escape(f"{name}={value!r}: it must be ")):
         make_model(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("ent_coef", value) for value in ("auto", "auto_0.1", "auto_1e-3", "0.1", 0, np.float32(0.1))),
+        *(("target_entropy", value) for value in ("auto", -1, "-1", np.float64(-0.5))),
+        *(("learning_rate", value) for value in (0.0, 1, lambda rest: rest, lambda rest: th.tensor(rest))),
+        ("learning_starts", 10**20),
+    ],
+)
+def test_what_sac_accepts_is_accepted(name: str, value: Any) -> None:
+    make_model(**{name: value})
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,10 @@ import numpy as np
 import pytest
 import torch as th
 import yaml
+from sb3_contrib import QRDQN
 from small_models import NormDropout, StopAt, logged_steps, make_model, pendulum
-from stable_baselines3 import HerReplayBuffer
+from stable_baselines3 import DQN, TD3, HerReplayBuffer
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
@@ -291,6 +293,12 @@ def test_other_versions_continue_in_new_episodes(task: str, tmp_path: Path, monk
     if task == "state":
         np.testing.assert_array_equal(continued.env.obs_rms.mean, model.env.obs_rms.mean)
     assert continued.learn(20, reset_num_timesteps=False).num_timesteps == 80
+
+
+@pytest.mark.parametrize(("algorithm", "env"), [(DQN, "CartPole-v1"), (QRDQN, "CartPole-v1"), (TD3, "Pendulum-v1")])
+def test_other_algorithms_with_batch_norm_lists_are_loaded(algorithm: type[BaseAlgorithm], env: str, tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "checkpoint.pkl", algorithm("MlpPolicy", env, buffer_size=100))  # type: ignore[call-arg]
+    assert type(load_checkpoint(tmp_path / "checkpoint.pkl")[0]) is algorithm
 
 
 def test_new_episodes_in_another_number_of_environments_are_refused(tmp_path: Path) -> None:

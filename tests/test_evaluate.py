@@ -11,8 +11,10 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 from PIL import Image
+from rl_zoo3.utils import EnvironmentName
 
 from sb3_robust_bisim import BisimSAC
+from sb3_robust_bisim.cli.agents import latest_run
 from sb3_robust_bisim.cli.distractors import Noise, Scene, distractors_of
 from sb3_robust_bisim.cli.scores import Score
 from sb3_robust_bisim.cli.zoo import main
@@ -221,6 +223,15 @@ def test_bad_input_is_refused_before_any_work(logs: str, arguments: list[str], m
     with pytest.raises(ValueError, match=message):
         main(["evaluate", "--env", CARTPOLE, "-f", logs, "--out", str(tmp_path / "out"), *arguments])
     assert not (tmp_path / "out").exists()
+
+
+def test_the_latest_run_is_one_that_has_the_agent(tmp_path: Path) -> None:
+    for number, steps in ((1, 500), (2, 500), (3, 900)):
+        run = tmp_path / "bisim_sac" / f"robust_bisim-SparseCartPole-v0_{number}"
+        run.mkdir(parents=True)
+        (run / f"rl_model_{steps}_steps.zip").touch()
+    which = (str(tmp_path), "bisim_sac", EnvironmentName(CARTPOLE))
+    assert [latest_run(*which, steps=steps) for steps in ("500", "900", "*", None)] == [2, 3, 3, 0]
 
 
 @pytest.mark.parametrize(

@@ -225,15 +225,24 @@ def test_the_error_for_a_task_without_settings_lists_the_tasks_with_settings(zoo
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "--env None: name a registered task. If your package registers it, add --gym-packages"),
-        (["--env", "robust_bisim/SparseCartpole-v0"], f"name a registered task, did you mean '{CARTPOLE}'? If your"),
-        (["--env", "x"], "--env x: name a registered task. If your"),
+        (["train"], "train: error: --env: name the task."),
+        (["enjoy"], "enjoy: error: --env: name the task."),
+        (["train", "--env", "robust_bisim/SparseCartpole-v0"], f"no such task, did you mean '{CARTPOLE}'? If your"),
+        (["train", "--env", "x"], "--env x: no such task. If your package registers it, add --gym-packages"),
     ],
 )
 def test_a_task_that_does_not_exist_is_refused_with_the_closest_one(zoo: Zoo, arguments: list[str], message: str) -> None:
     with pytest.raises(SystemExit):
-        zoo("train", *arguments)
+        zoo(*arguments)
     assert message in zoo.output
+
+
+@pytest.mark.parametrize("packages", [["--gym-packages", "json"], ["--gym-packages=json"]])
+def test_a_task_of_a_package_is_left_to_rl_zoo3(zoo: Zoo, packages: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[str] = []
+    monkeypatch.setattr(rl_zoo3.train, "train", lambda: seen.extend(sys.argv))
+    zoo("train", "--env", "My-v0", *packages)
+    assert seen[seen.index("--env") + 1] == "My-v0"
 
 
 @pytest.mark.parametrize(

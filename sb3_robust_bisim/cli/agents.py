@@ -92,16 +92,16 @@ class Agent:
         return algorithm.load(self.path, venv, device, custom_objects=unused, verbose=0, **small)
 
 
-def latest_run(folder: str, algo: str, env: EnvironmentName, load_best: bool = False, load_checkpoint: bool = False) -> int:
+def latest_run(folder: str, algo: str, env: EnvironmentName, load_best: bool = False, steps: str | None = None) -> int:
     """
     :param folder: folder with the runs
     :param algo: name of the algorithm
     :param env: task
     :param load_best: the best agent is wanted, not the last one
-    :param load_checkpoint: one that was saved during training is wanted
+    :param steps: the agent after this number of steps is wanted; "*": after any
     :return: number of the latest run with such an agent; 0 if there is none. rl-zoo3 takes the latest folder
     """
-    name = "best_model" if load_best else "rl_model_*_steps" if load_checkpoint else env
+    name = "best_model" if load_best else env if steps is None else f"rl_model_{steps}_steps"
     runs = Path(folder, algo).glob(f"{env}_*/{name}.zip")
     numbers = [suffix for run in runs if (suffix := run.parent.name.removeprefix(f"{env}_")).isdigit()]
     return max(map(int, numbers), default=0)
@@ -141,13 +141,14 @@ def find_agent(
     :return: the agent
     :raises UsageError: if there is no such agent
     """
-    exp_id = exp_id or latest_run(folder, algo, env, load_best, load_last_checkpoint or load_checkpoint is not None)
+    cause = f"--exp-id {exp_id}" if exp_id else f"--folder {folder}"
+    steps = "*" if load_last_checkpoint else load_checkpoint
+    exp_id = exp_id or latest_run(folder, algo, env, load_best, steps)
     try:
         if exp_id == 0:
             raise ValueError(f"No run of {algo} on {env.gym_id} has an agent")
         _, model, log_path = get_model_path(exp_id, folder, algo, env, load_best, load_checkpoint, load_last_checkpoint)
     except (AssertionError, ValueError) as error:
-        cause = f"--exp-id {exp_id}" if exp_id else f"--folder {folder}"
         raise UsageError(
             f"{cause}: {error}. Pass the --folder, --algo and --exp-id of a run that has one, or train it: "
             f"robust-bisim train --env {env.gym_id}"

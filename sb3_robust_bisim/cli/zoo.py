@@ -180,9 +180,12 @@ def _train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, li
     ours, theirs = _parse(parser, arguments)
     if ours.env is not None:
         theirs += ["--env", ours.env]
-    if ours.env not in gym.registry and not {"-h", "--help", "--gym-packages"} & set(arguments):
-        known = "." if ours.env is None else closest(ours.env, gym.registry, ".")
-        parser.error(f"--env {ours.env}: name a registered task{known} If your package registers it, add --gym-packages.")
+    if not any(argument in ("-h", "--help") or argument.startswith("--gym-p") for argument in arguments):
+        if ours.env is None:
+            parser.error("--env: name the task.")
+        if ours.env not in gym.registry:
+            guess = closest(ours.env, gym.registry, ".")
+            parser.error(f"--env {ours.env}: no such task{guess} If your package registers it, add --gym-packages.")
     if ours.checkpoint_freq < 1:
         parser.error(f"--checkpoint-freq {ours.checkpoint_freq}: must be at least 1.")
     if ours.n_timesteps is not None and ours.n_timesteps < 1:  # rl-zoo3 would take the config file's
@@ -224,7 +227,7 @@ def _enjoy(program: str, arguments: list[str]) -> None:
     if ours.trained and (ours.algo != ALGO or task not in trained_tasks()):
         parser.error(f"--trained: the package has agents of {ALGO} for --env {', '.join(trained_tasks())}, and no others.")
     if task is None:
-        parser.error("--env: name the task, as in training.")
+        parser.error("--env: name the task.")
     video = None if ours.video is None else _video_arguments(program, arguments)
     with trained_run(ALGO, ours.env) if ours.trained else nullcontext(ours.folder) as found:
         if video is not None:

@@ -19,6 +19,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch as th
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -44,7 +45,7 @@ class Checkpoint(BaseCallback):
 
     def __init__(self, path: str | Path, every: int, context: Any = None, about: dict[str, Any] | None = None) -> None:
         super().__init__()
-        if not isinstance(every, int) or every < 1:
+        if not isinstance(every, (int, np.integer)) or isinstance(every, bool) or every < 1:
             raise ValueError(f"every={every!r}: it must be an integer >= 1, the environment steps between two checkpoints.")
         self.path = Path(path)
         self.every = every
@@ -231,8 +232,9 @@ def _link_batch_norm(model: BaseAlgorithm) -> None:
     for name in [name for name in vars(model) if name.removesuffix("_target").endswith("batch_norm_stats")]:
         target = "_target" if name.endswith("_target") else ""
         owner = name.removesuffix("_target").removesuffix("batch_norm_stats").rstrip("_")  # TD3 has those of its actor, too
-        net = owner or ("critic" if hasattr(model, "critic") else "q_net")
-        setattr(model, name, get_parameters_by_name(getattr(model, net + target), ["running_"]))
+        nets = [owner] if owner else ["critic", "q_net", "quantile_net"]  # of SAC, DQN and QRDQN
+        for net in (getattr(model, net + target) for net in nets if hasattr(model, net + target)):
+            setattr(model, name, get_parameters_by_name(net, ["running_"]))
 
 
 def _skip_next(obj: Any, method: str) -> None:

@@ -39,6 +39,7 @@ from torch.nn import functional as F
 from tqdm import tqdm
 
 from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer, IntrinsicRewardVecEnv
+from sb3_robust_bisim.checks import has_bf16
 from sb3_robust_bisim.cli.zoo_config import DEFAULT_CONFIG, variant_settings
 from sb3_robust_bisim.encoders import MlpEncoder, PixelEncoder
 
@@ -46,7 +47,7 @@ BATCH = {"mlp": 512, "cnn": 128}
 SCHEDULE = {"paper": dict(policy_delay=2, target_update_interval=2), "sac": dict(policy_delay=1)}
 FULL = dict(intrinsic_reward_scale=2.0, inverse_dynamics_coef=1.0)
 # bf16 without its instructions is emulated, and many times slower
-PRECISIONS = (False, True) if getattr(th.ops.mkldnn, "_is_mkldnn_bf16_supported", bool)() else (False,)
+PRECISIONS = (False, True) if has_bf16(th.device("cpu")) else (False,)
 CPU = dict(device="cpu", seed=0)  # as the floor
 OFF = dict(bisim_coef=0.0, norm_constraint=False)
 CARTPOLE = "robust_bisim/SparseCartPole-v0"

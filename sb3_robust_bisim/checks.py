@@ -36,7 +36,9 @@ def check_arguments(model: Any) -> None:
     _check_train_freq(model)
     _check_entropy(model)
     _check_learning_rate(model)
-    _warn_of_emulation(model)
+    if model.bf16 and not has_bf16(model.device):
+        unit = "GPU" if model.device.type == "cuda" else "CPU"
+        warnings.warn(f"bf16=True: this {unit} has no bfloat16 instructions, so fp32 is several times faster.", stacklevel=4)
     _check_random_shift(model.random_shift, model.observation_space)
     n_steps = model.n_steps if model.n_steps != 1 else model.replay_buffer_kwargs.get("n_steps", 1)
     buffer_class = model.replay_buffer_class
@@ -95,16 +97,11 @@ def _finite(value: Any) -> float:
     return number if np.isfinite(number) else -np.inf
 
 
-def _warn_of_emulation(model: Any) -> None:
-    if not model.bf16:
-        return
-    if model.device.type == "cpu":
-        fast = getattr(th.ops.mkldnn, "_is_mkldnn_bf16_supported", bool)()
-    else:
-        fast = model.device.type != "cuda" or th.cuda.is_bf16_supported(including_emulation=False)
-    if not fast:
-        unit = model.device.type.upper().replace("CUDA", "GPU")
-        warnings.warn(f"bf16=True: this {unit} has no bfloat16 instructions, so fp32 is several times faster.", stacklevel=5)
+def has_bf16(device: th.device) -> bool:
+    """Whether a CPU or an NVIDIA GPU has bfloat16 instructions, which torch emulates otherwise. Of others it is assumed."""
+    if device.type == "cpu":
+        return getattr(th.ops.mkldnn, "_is_mkldnn_bf16_supported", bool)()
+    return device.type != "cuda" or th.cuda.is_bf16_supported(including_emulation=False)
 
 
 def _check_train_freq(model: Any) -> None:
@@ -143,7 +140,7 @@ def checked_env(env: Any, verbose: int) -> Any:
 
 
 def _check_random_shift(pad: Any, space: spaces.Space) -> None:
-    if not isinstance(pad, (int, np.integer)) or isinstance(pad, bool) or pad < 0:
+    if not _is_whole(pad, 0):
         raise ValueError(f"random_shift={pad!r}: it must be an integer in [0, image size), 0 for none.")
     if pad > 0 and not is_image_space(space):
         raise ValueError(f"random_shift={pad} with observations {space}: it needs images of bytes. Set random_shift=0.")

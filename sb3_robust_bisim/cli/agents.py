@@ -57,7 +57,6 @@ class Agent:
     :param stats: folder with the settings and the statistics of VecNormalize; None: there are none
     :param hyperparams: saved hyperparameters, which name the wrappers of the environment
     :param env_kwargs: arguments of the environment
-    :param exp_id: number of its run; -1: the agent is not in the folder of a run
     """
 
     algo: str
@@ -66,7 +65,6 @@ class Agent:
     stats: str | None
     hyperparams: dict[str, Any]
     env_kwargs: dict[str, Any]
-    exp_id: int
 
     def make_env(self, env_kwargs: Mapping[str, Any], seed: int) -> VecEnv:
         """
@@ -107,56 +105,43 @@ def latest_run(folder: str, algo: str, env: EnvironmentName, load_best: bool = F
     return max(map(int, numbers), default=0)
 
 
+def find_file(args: argparse.Namespace) -> tuple[Path, int]:
+    """
+    Find the file of an agent as rl-zoo3's ``enjoy`` does.
+
+    :param args: see :func:`add_agent_arguments`, and ``algo``
+    :return: the file, and the number of its run; -1 if it is not in the folder of a run
+    :raises UsageError: if there is no such agent
+    """
+    cause = f"--exp-id {args.exp_id}" if args.exp_id else f"--folder {args.folder}"
+    steps = "*" if args.load_last_checkpoint else args.load_checkpoint
+    exp_id = args.exp_id or latest_run(args.folder, args.algo, args.env, args.load_best, steps)
+    which = (args.load_best, args.load_checkpoint, args.load_last_checkpoint)
+    try:
+        if exp_id == 0:
+            raise ValueError(f"No run of {args.algo} on {args.env.gym_id} has an agent")
+        _, model, _ = get_model_path(exp_id, args.folder, args.algo, args.env, *which)
+    except (AssertionError, ValueError) as error:
+        raise UsageError(
+            f"{cause}: {error}. Pass the --folder, --algo and --exp-id of a run that has one, or train it: "
+            f"robust-bisim train --env {args.env.gym_id}"
+        ) from error
+    return Path(model), exp_id
+
+
 def chosen_agent(args: argparse.Namespace) -> Agent:
     """
     :param args: see :func:`add_agent_arguments`, and ``algo``
     :return: the agent
-    :raises UsageError: see :func:`find_agent`
+    :raises UsageError: see :func:`find_file`
     """
     for package in args.gym_packages:
         importlib.import_module(package)
-    which = (args.exp_id, args.load_best, args.load_checkpoint, args.load_last_checkpoint)
-    return find_agent(args.folder, args.algo, args.env, *which)
-
-
-def find_agent(
-    folder: str,
-    algo: str,
-    env: EnvironmentName,
-    exp_id: int = 0,
-    load_best: bool = False,
-    load_checkpoint: str | None = None,
-    load_last_checkpoint: bool = False,
-) -> Agent:
-    """
-    Find an agent as rl-zoo3's ``enjoy`` does.
-
-    :param folder: folder with the runs
-    :param algo: name of the algorithm
-    :param env: task
-    :param exp_id: number of the run; 0: the latest one with an agent; -1: the agent is not in the folder of a run
-    :param load_best: the best agent of the run, not the last one
-    :param load_checkpoint: the agent after this number of steps
-    :param load_last_checkpoint: the last of these
-    :return: the agent
-    :raises UsageError: if there is no such agent
-    """
-    cause = f"--exp-id {exp_id}" if exp_id else f"--folder {folder}"
-    steps = "*" if load_last_checkpoint else load_checkpoint
-    exp_id = exp_id or latest_run(folder, algo, env, load_best, steps)
-    try:
-        if exp_id == 0:
-            raise ValueError(f"No run of {algo} on {env.gym_id} has an agent")
-        _, model, log_path = get_model_path(exp_id, folder, algo, env, load_best, load_checkpoint, load_last_checkpoint)
-    except (AssertionError, ValueError) as error:
-        raise UsageError(
-            f"{cause}: {error}. Pass the --folder, --algo and --exp-id of a run that has one, or train it: "
-            f"robust-bisim train --env {env.gym_id}"
-        ) from error
-    stats = os.path.join(log_path, env)
+    file, _ = find_file(args)
+    stats = os.path.join(file.parent, args.env)
     hyperparams, found_stats = get_saved_hyperparams(stats, test_mode=True)
     env_kwargs = hyperparams.pop("env_kwargs", {})
     arguments = Path(stats, "args.yml")
     if arguments.is_file():  # --env-kwargs of the training replaces those of the configuration
         env_kwargs = yaml.unsafe_load(arguments.read_text())["env_kwargs"] or env_kwargs
-    return Agent(algo, env.gym_id, Path(model), found_stats, hyperparams, env_kwargs, exp_id)
+    return Agent(args.algo, args.env.gym_id, file, found_stats, hyperparams, env_kwargs)

@@ -23,7 +23,7 @@ from rl_zoo3.utils import EnvironmentName
 
 from sb3_robust_bisim.bisim_sac import BisimSAC
 from sb3_robust_bisim.checks import closest
-from sb3_robust_bisim.cli.agents import Agent, add_agent_arguments, chosen_agent
+from sb3_robust_bisim.cli.agents import add_agent_arguments, find_file
 from sb3_robust_bisim.cli.enjoy import record_episode, trained_run, trained_tasks
 from sb3_robust_bisim.cli.errors import UsageError
 from sb3_robust_bisim.cli.evaluate import DESCRIPTION, add_arguments, check_arguments, evaluate
@@ -238,7 +238,7 @@ def _enjoy(program: str, arguments: list[str]) -> None:
         exp_id = ours.exp_id
         if "rl-trained-agents" not in found:  # rl-zoo3 downloads those
             try:
-                exp_id = _agent_to_play(program, arguments, found).exp_id
+                exp_id = _run_to_play(program, arguments, found)
             except UsageError as error:
                 tasks = ", ".join(trained_tasks())
                 parser.error(f"{error}. --trained plays an agent that comes with the package, for {tasks}.")
@@ -246,13 +246,13 @@ def _enjoy(program: str, arguments: list[str]) -> None:
             rl_zoo3.enjoy.enjoy()
 
 
-def _agent_to_play(program: str, arguments: list[str], folder: str) -> Agent:
-    """The agent that `enjoy` is to play; rl-zoo3 would end with a traceback if there is none."""
+def _run_to_play(program: str, arguments: list[str], folder: str) -> int:
+    """The number of the run whose agent `enjoy` is to play; rl-zoo3 would end with a traceback if there is none."""
     parser = _parser(program)
     add_agent_arguments(parser)
     args, _ = parser.parse_known_args(arguments)
     args.folder = folder
-    return chosen_agent(args)
+    return find_file(args)[1]
 
 
 def _video_arguments(program: str, arguments: list[str]) -> argparse.Namespace:

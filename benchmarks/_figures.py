@@ -3,8 +3,8 @@ What is compared: tasks, methods, seeds and steps, after the figures of the pape
 
 At a scale that a small machine finishes: the paper runs 10 seeds (5 from pixels), 50,000 steps of cartpole, 100,000 of
 pendulum and mountain car, 500,000 of each of 16 environments from pixels. `dmc_state`, `bf16`, `headline`, `metric`,
-`metric_control`, `options`, the methods `self-prediction` and `self-prediction-IR` and those with `half` in their names are
-not in the paper.
+`metric_control`, `options`, `dmc_pixels_long`, the methods `self-prediction` and `self-prediction-IR` and those with `half` in
+their names are not in the paper.
 """
 
 from dataclasses import dataclass, field
@@ -120,6 +120,7 @@ def _without(*names: str) -> dict[str, float]:
 
 
 _SELF_PREDICTION = _without("c_r", "bisim_coef", "inverse_dynamics_coef")
+_LONG = {"gradient_steps": 5, "buffer_size": 125_000}
 
 FIGURES = {
     "cartpole": Figure(
@@ -211,7 +212,7 @@ FIGURES = {
             "self-prediction-metric": Method(
                 ("self-prediction",),
                 {**_SELF_PREDICTION, "bisim_coef": 3.0, "distance": "l2", "c_r": 0.3, "c_t": 0.9},
-                panels=("video",),
+                panels=("video", "ball_in_cup"),
             ),
             "SAC-shift": Method(("SAC",)),
             "normed-IR-ID-no-metric": Method(("normed-IR-ID", "no-metric"), _without("bisim_coef"), panels=("video",)),
@@ -220,6 +221,15 @@ FIGURES = {
             "SAC": Method(("SAC",), {"random_shift": 0}, panels=("video",)),
         },
         *(2, 80_000, 4000, 5, 50),
+    ),
+    # a million frames, where published agents are compared, and twice the updates
+    "dmc_pixels_long": Figure(
+        {"video": Panel(SWINGUP_PIXELS, variants=("small",), splits=("train", "eval"))},
+        {
+            "self-prediction-shift": Method(("self-prediction",), {**_SELF_PREDICTION, **_LONG}),
+            "SAC-shift": Method(("SAC",), _LONG),
+        },
+        *(2, 125_000, 5000, 5, 45),
     ),
     "bf16": Figure(
         _noisy(CARTPOLE, 2),

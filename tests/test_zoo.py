@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+from argparse import ArgumentParser
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer
 from sb3_robust_bisim.cli.manager import BisimExperimentManager, sample_bisim_sac_params
 from sb3_robust_bisim.cli.report import report
+from sb3_robust_bisim.cli.settings import StoreSettings
 from sb3_robust_bisim.cli.zoo import SET_BY_THE_USER, main, shell
 from sb3_robust_bisim.cli.zoo_config import check_keys, variant_settings
 
@@ -201,6 +203,45 @@ def test_bad_input_is_refused_before_a_run_folder_exists(zoo: Zoo, arguments: li
     with pytest.raises(ValueError, match=message):
         zoo("train", "--env", CARTPOLE, *arguments, "-f", str(tmp_path / "logs"))
     assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["-params", "ent_coef:-1"], "ent_coef=-1: it must be a number >= 0"),
+        (["--env-kwargs", "noise_multiplier:-2"], "noise_multiplier must be an integer >= 0 .* got -2"),
+    ],
+)
+def test_a_value_that_algorithm_or_task_refuses_leaves_no_run(
+    zoo: Zoo, arguments: list[str], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        zoo("train", "--env", CARTPOLE, *arguments, "-f", str(tmp_path / "logs"))
+    assert not list((tmp_path / "logs" / "bisim_sac").iterdir())
+
+
+def _settings(*values: str) -> dict[str, Any]:
+    parser = ArgumentParser()
+    parser.add_argument("-params", nargs="+", action=StoreSettings)
+    return parser.parse_args(["-params", *values]).params
+
+
+def test_a_word_needs_no_quotes_in_a_setting() -> None:
+    words = _settings("distractor:video", "pairs:all", "ent_coef:auto_0.1", "learning_rate:lin_3e-4", "files:clips/a.mp4")
+    assert words == {
+        **{"distractor": "video", "pairs": "all", "ent_coef": "auto_0.1"},  # `all` is a function in Python
+        **{"learning_rate": "lin_3e-4", "files": "clips/a.mp4"},
+    }
+    values = _settings("a:1e-3", "b:'video'", "c:None", "d:True", "e:dict(net_arch=[64])", "f:(0, 8)")
+    assert values == {"a": 1e-3, "b": "video", "c": None, "d": True, "e": {"net_arch": [64]}, "f": (0, 8)}
+
+
+@pytest.mark.parametrize("value", ["noise_multiplier", "noise_multiplier:", "noise_multiplier:[1", "noise_multiplier:2 3"])
+def test_a_setting_that_is_neither_word_nor_value_is_an_error_of_usage(zoo: Zoo, value: str, tmp_path: Path) -> None:
+    for command in ("train", "enjoy", "evaluate"):
+        with pytest.raises(SystemExit):
+            zoo(command, "--env", CARTPOLE, "-f", str(tmp_path), "--env-kwargs", value)
+        assert f"--env-kwargs {value}: write NAME:VALUE with a word or a Python value" in zoo.output
 
 
 def test_a_shell_shows_what_a_command_cannot_do_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

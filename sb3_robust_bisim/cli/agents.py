@@ -12,12 +12,13 @@ from typing import Any
 import yaml
 from rl_zoo3 import ALGOS, create_test_env, get_saved_hyperparams
 from rl_zoo3.exp_manager import ExperimentManager
-from rl_zoo3.utils import EnvironmentName, StoreDict, get_model_path
+from rl_zoo3.utils import EnvironmentName, get_model_path
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_robust_bisim.cli.errors import UsageError
+from sb3_robust_bisim.cli.settings import StoreSettings
 
 
 def add_agent_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,7 +38,7 @@ def add_agent_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--env-kwargs",
         nargs="+",
-        action=StoreDict,
+        action=StoreSettings,
         default={},
         metavar="NAME:VALUE",
         help="arguments of the environment, merged into those of the training, for example theta_rew_fraction:1.0",

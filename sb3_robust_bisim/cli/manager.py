@@ -1,6 +1,7 @@
 """rl-zoo3's experiment manager, extended with named variants, evaluation in another task, exact continuation and a report."""
 
 import inspect
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -90,6 +91,7 @@ class BisimExperimentManager(ExperimentManager):
         self.options = options
         self.variants = list(options.variants)
         self.resumed = False
+        self.made_folder: Path | None = None
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         params = self.custom_hyperparams or {}
@@ -149,9 +151,18 @@ class BisimExperimentManager(ExperimentManager):
         return {**found, "policy_kwargs": merged_policy_kwargs(configured, found["policy_kwargs"])}
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
-        checkpoint = self.options.checkpoint
         if self.vec_env_class is SubprocVecEnv:  # ours can be saved, and closed after its workers have ended
             self.vec_env_class = ResumableSubprocVecEnv
+        try:
+            return self._set_up()
+        except Exception:  # a value that environment or algorithm refuses leaves no run behind
+            if self.made_folder is not None:
+                shutil.rmtree(self.made_folder, ignore_errors=True)
+            raise
+
+    def _set_up(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        """Create the run, with a checkpoint if asked for, or continue it."""
+        checkpoint = self.options.checkpoint
         if checkpoint is None:
             return super().setup_experiment()
         if self.optimize_hyperparameters:
@@ -174,6 +185,7 @@ class BisimExperimentManager(ExperimentManager):
                 self.params_path = f"{self.save_path}/{self.env_name}"
                 break
         super().create_log_folder()
+        self.made_folder = Path(self.save_path)
 
     def _begin(self, checkpoint: Path) -> tuple[BaseAlgorithm, dict[str, Any]]:
         """Create a run that writes checkpoints."""

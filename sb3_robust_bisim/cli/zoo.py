@@ -29,6 +29,7 @@ from sb3_robust_bisim.cli.errors import UsageError
 from sb3_robust_bisim.cli.evaluate import DESCRIPTION, add_arguments, check_arguments, evaluate
 from sb3_robust_bisim.cli.manager import ALGO, BisimExperimentManager, RunOptions, sample_bisim_sac_params
 from sb3_robust_bisim.cli.record import check_video
+from sb3_robust_bisim.cli.settings import StoreSettings
 from sb3_robust_bisim.cli.zoo_config import DEFAULT_CONFIG, is_yaml
 
 ALGOS[ALGO] = BisimSAC
@@ -66,6 +67,7 @@ def main(arguments: Sequence[str] | None = None, program: str = "robust-bisim") 
         with (
             _replaced(sys, "argv", [program, *theirs]),
             _replaced(rl_zoo3.train, "ExperimentManager", manager),
+            _replaced(rl_zoo3.train, "StoreDict", StoreSettings),
             _only_run(program, ours.checkpoint),
             _sigterm_as_ctrl_c(),
         ):
@@ -242,7 +244,8 @@ def _enjoy(program: str, arguments: list[str]) -> None:
             except UsageError as error:
                 tasks = ", ".join(trained_tasks())
                 parser.error(f"{error}. --trained plays an agent that comes with the package, for {tasks}.")
-        with _replaced(sys, "argv", [program, *theirs, "-f", found, "--exp-id", str(exp_id), "--env", task]):
+        options = [*theirs, "-f", found, "--exp-id", str(exp_id), "--env", task]
+        with _replaced(sys, "argv", [program, *options]), _replaced(rl_zoo3.enjoy, "StoreDict", StoreSettings):
             rl_zoo3.enjoy.enjoy()
 
 

@@ -15,6 +15,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.sac.sac import SAC
 
+from sb3_robust_bisim.objective import is_number
 from sb3_robust_bisim.policies import BisimPolicy, MlpPolicy, MultiInputPolicy
 
 # The smallest value of each integer argument
@@ -30,9 +31,9 @@ def check_arguments(model: Any) -> None:
     for name, least in LEAST.items():
         _require(_is_whole(getattr(model, name), least), model, name, f"an integer >= {least}")
     _require(_is_whole(model.gradient_steps, -1), model, "gradient_steps", "an integer >= 0, or -1 for one per step")
-    _require(_is_number(model.learning_starts) and model.learning_starts >= 0, model, "learning_starts", "a number >= 0")
-    _require(_is_number(model.gamma) and 0 <= model.gamma <= 1, model, "gamma", "in [0, 1]")
-    _require(_is_number(model.tau) and 0 <= model.tau <= 1, model, "tau", "in [0, 1]")
+    _require(is_number(model.learning_starts, 0), model, "learning_starts", "a number >= 0")
+    _require(is_number(model.gamma, 0) and model.gamma <= 1, model, "gamma", "in [0, 1]")
+    _require(is_number(model.tau, 0) and model.tau <= 1, model, "tau", "in [0, 1]")
     _check_train_freq(model)
     _check_entropy(model)
     _check_learning_rate(model)
@@ -161,10 +162,6 @@ def _check_policy_fits(model: Any) -> None:
 
 def _is_whole(value: Any, least: int) -> bool:
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= least)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float, np.number)) and not isinstance(value, bool) and _finite(value) > -np.inf
 
 
 def _require(condition: Any, model: Any, name: str, remedy: str) -> None:

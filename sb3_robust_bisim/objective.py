@@ -48,18 +48,18 @@ class Objective:
         is_dict = self.metric_kwargs is None or isinstance(self.metric_kwargs, dict)
         self._require(is_dict, "metric_kwargs", "None or a dict")
         for name in ("bisim_coef", "c_r", "intrinsic_reward_scale", "intrinsic_reward_max", "inverse_dynamics_coef"):
-            self._require(_is_number(getattr(self, name), 0), name, "a finite number >= 0")
+            self._require(is_number(getattr(self, name), 0), name, "a finite number >= 0")
         for name in ("model_coef", "reward_coef"):
             self._require(
-                getattr(self, name) is None or _is_number(getattr(self, name), 0), name, "None or a finite number >= 0"
+                getattr(self, name) is None or is_number(getattr(self, name), 0), name, "None or a finite number >= 0"
             )
         remedy = "above 0 where bisim_coef or intrinsic_reward_scale needs the dynamics model"
         self._require(self.model_coef != 0 or not self.needs_model, "model_coef", remedy)
-        self._require(_is_number(self.c_t, 0) and self.c_t < 1, "c_t", "None (gamma) or in [0, 1), else no metric exists")
+        self._require(is_number(self.c_t, 0) and self.c_t < 1, "c_t", "None (gamma) or in [0, 1), else no metric exists")
         ordered = bool(
             isinstance(self.reward_range, (tuple, list))
             and len(self.reward_range) == 2
-            and all(map(_is_number, self.reward_range))
+            and all(map(is_number, self.reward_range))
             and self.reward_range[0] < self.reward_range[1]
         )
         self._require(ordered, "reward_range", "(R_min, R_max), finite, with R_min < R_max")
@@ -69,7 +69,7 @@ class Objective:
         self._require(not point, "c_r", "above 0, or norm_constraint=False: the ball is a point")
         self._require(self.distance in tuple(DISTANCES), "distance", f"one of {', '.join(DISTANCES)}")
         self._require(self.dynamics in DYNAMICS, "dynamics", f"one of {', '.join(DYNAMICS)}")
-        self._require(_is_number(self.nll_beta, 0) and self.nll_beta <= 1, "nll_beta", "in [0, 1]")
+        self._require(is_number(self.nll_beta, 0) and self.nll_beta <= 1, "nll_beta", "in [0, 1]")
         on_sphere = self.distance != "cosine" or self.norm_constraint == "sphere"
         self._require(on_sphere, "distance", 'another one, or norm_constraint="sphere": it is meant for unit vectors')
         known = [field.name for field in fields(Metric)][3:]
@@ -125,10 +125,10 @@ class Objective:
         return self.c_r / (1 - self.c_t)
 
 
-def _is_number(value: Any, least: float = -np.inf) -> bool:
+def is_number(value: Any, least: float = -np.inf) -> bool:
     """Whether a value is a finite number (a bool is none) and at least ``least``."""
     return (
         isinstance(value, (int, float, np.number))
         and not isinstance(value, bool)
-        and bool(np.isfinite(value) and value >= least)
+        and bool(-np.inf < value < np.inf and value >= least)
     )

@@ -31,7 +31,7 @@ MAY_KNOW: dict[str, set[str]] = {
     "metrics": {"losses"},
     "heads": {"encoders"},
     "policies": {"augmentation", "encoders", "heads", "latent_models", "objective", "representation"},
-    "checks": {"policies"},
+    "checks": {"objective", "policies"},
     "bisim_sac": {
         *("checks", "data_checks", "frame_buffer", "heads", "intrinsic_reward", "objective", "policies", "runs", "update_log"),
     },

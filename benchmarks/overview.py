@@ -1,9 +1,11 @@
 """
-One table of all methods on all tasks, from the results of `reproduce.py`: mean last return, standard error and runs.
+One table of all methods on all tasks, from the results of `reproduce.py`: mean last return, standard error and runs. In front
+of video, it is the mean of the final agent's 20 episodes with the held-out clip.
 
     python benchmarks/overview.py       # replaces the table in docs/choosing.md
 
-A result in bold is the best of its task, or would be it with one standard error of its own added.
+Bold: the highest mean of a column, and every mean that is at least as high once its own standard error is added;
+none if that is a single run.
 """
 
 import argparse
@@ -23,6 +25,7 @@ TASKS: dict[str, tuple[str, tuple[str, ...]]] = {
     "cartpole, N_m = 0": ("N_m=0", ON_CARTPOLE),
     "N_m = 2": ("N_m=2", ON_CARTPOLE),
     "N_m = 3": ("N_m=3", ON_CARTPOLE),
+    "mountain car, N_m = 1": ("N_m=1", ("mountain_car",)),
     "mountain car, N_m = 2": ("N_m=2", ("mountain_car",)),
     "swingup_sparse, state": ("cartpole-swingup_sparse", ("dmc_state",)),
     "swingup_sparse, projected": ("cartpole-swingup_sparse", ("metric_control",)),
@@ -60,7 +63,8 @@ def last_returns(panel: str, figures: tuple[str, ...]) -> dict[str, list[float]]
         for path in sorted((RESULTS / figure).glob("*_seed*.json")):
             run = json.loads(path.read_text())
             if (run["panel"], run["steps"]) == (panel, FIGURES[figure].steps):
-                found.setdefault(run["method"], {})[run["seed"]] = float(np.mean(run["evaluations"][-1]["returns"]))
+                returns = run.get("final_return_by_split", {}).get("eval", run["evaluations"][-1]["returns"])
+                found.setdefault(run["method"], {})[run["seed"]] = float(np.mean(returns))
     return {method: list(seeds.values()) for method, seeds in found.items()}
 
 
@@ -74,7 +78,7 @@ def column(returns: dict[str, list[float]]) -> dict[str, str]:
     cells = {}
     for method, values in returns.items():
         text = f"{round(np.mean(values))}" + (f" ± {error(values):.0f}" if len(values) > 1 else "")
-        near = len(returns) > 1 and np.mean(values) + error(values) >= np.mean(returns[best])
+        near = min(len(returns), len(returns[best])) > 1 and np.mean(values) + error(values) >= np.mean(returns[best])
         cells[method] = f"{f'**{text}**' if near else text} ({len(values)})".replace(" ", "\N{NO-BREAK SPACE}")
     return cells
 

@@ -34,8 +34,8 @@ class BisimSAC(Interruptible, SAC):
     :param reward_range: (R_min, R_max) of one agent step: action repeat sums rewards. It sets the radius of the norm
         constraint. The bonus is not counted; the paper takes (0, 1) for all its tasks. ``learn()`` warns if it is too narrow
     :param norm_constraint: hold embeddings and predictions in the L2 ball of eq:constraint, with radius
-        c_R (R_max - R_min) / (2 (1 - c_T)). Between points of it only ``distance="l2"`` is at most the metric's diameter.
-        "sphere": scale embeddings to length 1 (SimSR)
+        c_R (R_max - R_min) / (2 (1 - c_T)). Of all distances, it limits only ``distance="l2"`` to the metric's largest
+        value. "sphere": scale embeddings to length 1 (SimSR)
     :param distance: "huber" (elementwise, the paper's), "l1", "l2", "mico", "cosine" or "rap"; :mod:`sb3_robust_bisim.losses`
     :param metric_kwargs: other settings of the metric, such as ``dict(successors="sample", absorbing=True)``; see
         :class:`sb3_robust_bisim.metrics.Metric`
@@ -50,7 +50,7 @@ class BisimSAC(Interruptible, SAC):
     :param policy_delay: gradient steps from one update of actor and entropy coefficient to the next. The target nets follow
         SAC's ``target_update_interval``
     :param initial_gradient_steps: gradient steps done at once when learning starts (1000 in the published experiments)
-    :param random_shift: shift the images of each batch by up to this many pixels (DrQ), s and s' apart; 0 turns it off
+    :param random_shift: shift the images of each batch by up to this many pixels (DrQ), s and s' by different amounts; 0: off
     :param bf16: run the encoder under bfloat16 autocast: meant for pixels on a GPU, or on a CPU that has it (see
         docs/performance.md). Heads, models and losses stay in fp32
     :param kwargs: the arguments of :class:`stable_baselines3.SAC`; ``n_steps`` must stay 1. Byte images go to a

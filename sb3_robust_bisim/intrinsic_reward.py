@@ -17,7 +17,7 @@ class IntrinsicRewardVecEnv(VecEnvWrapper):
     """
     Adds a bonus to the reward of each transition when it is collected, and writes it to ``info["intrinsic_reward"]``.
 
-    Without a bound function, the wrapper changes nothing, so training and evaluation can use the same chain of wrappers.
+    Until ``bind`` sets a function, the wrapper changes nothing, so training and evaluation can use the same chain of wrappers.
     :class:`~sb3_robust_bisim.BisimSAC` binds its bonus while ``learn()`` runs, and adds this wrapper as the outermost one if
     the chain has none. If you add it yourself, put it inside VecNormalize (off-policy algorithms ignore rewards that are
     changed outside of it) and outside of wrappers that change the shape of observations, such as VecFrameStack. Wrappers

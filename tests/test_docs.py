@@ -14,7 +14,7 @@ from unittest.mock import patch
 import gymnasium as gym
 import pytest
 import yaml
-from small_models import EVERYTHING, SMALL, make_model
+from small_models import EVERYTHING, SMALL
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from sybil import Example, Sybil
@@ -65,8 +65,6 @@ def test_the_python_examples_of_a_page_run_in_order(page: Path, tmp_path: Path, 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")  # a window without a display
     document = Sybil([CodeBlockParser("python", run_shortened)]).parse(page)
-    if page.name == "commands.md":
-        document.namespace["model"] = make_model()  # the page is about commands; its example goes on from any agent
     with ExitStack() as as_before:
         for names in (DISTANCES, DISTRACTORS):  # an example may enter names of its own
             as_before.enter_context(patch.dict(names))

@@ -295,8 +295,8 @@ def _parser(program: str, description: str = CHANGED, add_help: bool = False) ->
     parser.add_argument(
         "--num-threads",
         type=int,
-        help="number of CPU threads of torch; -1 leaves the choice to torch. The default is 1, because torch's threads wait "
-        "actively and slow each other down on a busy machine; with pixels on an idle machine, more may be faster. If one of "
+        help="number of CPU threads of torch; -1 leaves the choice to torch, which is faster on an idle machine. The default "
+        "is 1, which is faster beside other work, since torch's threads wait actively and slow each other down. If one of "
         f"{', '.join(SET_BY_THE_USER)} is set, the default is -1",
     )
     return parser

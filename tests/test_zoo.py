@@ -23,7 +23,7 @@ from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer
 from sb3_robust_bisim.cli.manager import BisimExperimentManager, sample_bisim_sac_params
 from sb3_robust_bisim.cli.report import report
 from sb3_robust_bisim.cli.settings import StoreSettings
-from sb3_robust_bisim.cli.zoo import SET_BY_THE_USER, main, shell
+from sb3_robust_bisim.cli.zoo import COMMANDS, SET_BY_THE_USER, main, shell
 from sb3_robust_bisim.cli.zoo_config import check_keys, variant_settings
 
 ROOT = Path(__file__).parent.parent
@@ -504,10 +504,18 @@ def test_help_shows_the_name_of_the_command_and_its_options(zoo: Zoo, command: s
 
 
 def test_the_package_runs_as_a_module_and_its_usage_names_the_commands(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "sb3_robust_bisim", "--help"]
+    arguments = [sys.executable, "-m", "sb3_robust_bisim", "--help"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=True)
-    assert "usage: python -m sb3_robust_bisim {train,enjoy,evaluate,plot_train,plot_from_file,all_plots}" in result.stderr
+    result = subprocess.run(arguments, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=True)
+    assert "usage: python -m sb3_robust_bisim COMMAND" in result.stdout
+    for command, what in COMMANDS.items():
+        assert re.search(rf"^  {command} +{what}$", result.stdout, re.MULTILINE)
+
+
+def test_a_misspelt_command_is_named_with_the_closest_one(zoo: Zoo) -> None:
+    with pytest.raises(SystemExit):
+        zoo("trian", "--env", CARTPOLE)
+    assert zoo.output.startswith("robust-bisim trian: there is no such command, did you mean 'train'?\n\nusage: robust-bisim")
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ def add_agent_arguments(parser: argparse.ArgumentParser) -> None:
         "--exp-id",
         type=int,
         default=0,
-        help="number of the run (default: the latest one with a saved agent; -1: no run folder)",
+        help="number of the run (default: the latest one with an agent; -1: no run folder)",
     )
     parser.add_argument("--load-best", action="store_true", help="play the best agent of the run, not the last one")
     parser.add_argument("--load-checkpoint", metavar="N", help="play the agent that was saved after N steps")

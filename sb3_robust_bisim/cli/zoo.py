@@ -36,7 +36,14 @@ ALGOS[ALGO] = BisimSAC
 HYPERPARAMS_SAMPLER[ALGO] = sample_bisim_sac_params
 HYPERPARAMS_CONVERTER[ALGO] = convert_offpolicy_params
 
-COMMANDS = ("train", "enjoy", "evaluate", "plot_train", "plot_from_file", "all_plots")
+COMMANDS = {
+    "train": "train an agent, or continue a run",
+    "enjoy": "watch an agent, in a window or as a video",
+    "evaluate": "play an agent under a list of distractors",
+    "plot_train": "draw the training returns of runs",
+    "plot_from_file": "draw what all_plots has collected",
+    "all_plots": "draw and collect the evaluations of runs",
+}
 CHANGED = "rl-zoo3's command with these options changed or added:"
 SET_BY_THE_USER = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OMP_WAIT_POLICY")
 
@@ -58,8 +65,9 @@ def main(arguments: Sequence[str] | None = None, program: str = "robust-bisim") 
     """
     command, *options = (sys.argv[1:] if arguments is None else arguments) or [""]
     if command not in COMMANDS:
-        print(f"usage: {program} {{{','.join(COMMANDS)}}} ...\n\nEach command has --help.", file=sys.stderr)
-        sys.exit(0 if command in ("-h", "--help") else 2)
+        asked = command in ("-h", "--help")
+        print(_usage(program, "" if asked else command), file=sys.stdout if asked else sys.stderr)
+        sys.exit(0 if asked else 2)
     program = f"{program} {command}"
     if command == "train":
         ours, theirs = _train_arguments(program, options)
@@ -84,6 +92,13 @@ def main(arguments: Sequence[str] | None = None, program: str = "robust-bisim") 
             raise ImportError(f"{command} needs the extra `plots`: pip install sb3_robust_bisim[plots]") from error
         with _replaced(sys, "argv", [program, *options]):
             getattr(plots, command)()
+
+
+def _usage(program: str, unknown: str) -> str:
+    """What the program can do, after a word about a command that it does not have."""
+    complaint = f"{program} {unknown}: there is no such command{closest(unknown, COMMANDS, '.')}\n\n" if unknown else ""
+    listed = "\n".join(f"  {name:<16}{what}" for name, what in COMMANDS.items())
+    return f"{complaint}usage: {program} COMMAND ...\n\n{listed}\n\nEach command has --help."
 
 
 @contextmanager
@@ -218,7 +233,7 @@ def _enjoy(program: str, arguments: list[str]) -> None:
     folder = parser.add_mutually_exclusive_group()
     folder.add_argument("-f", "--folder", default="logs", help="folder with the runs (default: %(default)s)")
     folder.add_argument("--trained", action="store_true", help="play the trained agent that comes with the package")
-    parser.add_argument("--exp-id", type=int, default=0, help="number of the run (default: the latest one with a saved agent)")
+    parser.add_argument("--exp-id", type=int, default=0, help="number of the run (default: the latest one with an agent)")
     parser.add_argument("--env", type=EnvironmentName, default=None, help="task")
     parser.add_argument("--video", type=Path, metavar="FILE", help="write one episode to an .mp4 or .gif, without a window")
     ours, theirs = _parse(parser, arguments)

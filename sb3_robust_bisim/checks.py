@@ -69,7 +69,10 @@ def check_arguments(model: Any) -> None:
         remedy = "pass its settings to BisimSAC" if name == "objective" else f"pass {name} to BisimSAC"
         raise ValueError(f"policy_kwargs with {name}={model.policy_kwargs[name]!r}: BisimSAC sets it; {remedy}.")
     if not (isinstance(model.policy_class, type) and issubclass(model.policy_class, BisimPolicy)):
-        raise ValueError(f"policy={model.policy_class!r}: it must be a subclass of sb3_robust_bisim.policies.BisimPolicy.")
+        raise ValueError(
+            f"policy={model.policy_class!r}: it must be a subclass of sb3_robust_bisim.policies.BisimPolicy. "
+            "Agents of SB3's SAC have another policy, so they cannot be loaded."
+        )
     if "features_extractor_class" not in model.policy_kwargs:
         _check_policy_fits(model)
 
@@ -185,6 +188,8 @@ def check_names(algorithm: type, kwargs: dict[str, Any], also: Iterable[str] = (
 
 
 def closest(name: str, known: Iterable[str], otherwise: str = ": see the documentation of BisimSAC and SAC.") -> str:
-    """The end of a message about a name that is not known."""
-    matches = difflib.get_close_matches(name, known, n=1)
-    return f", did you mean {matches[0]!r}?" if matches else otherwise
+    """The end of a message about a name that is not known: names that contain it, or the closest one."""
+    known = list(dict.fromkeys(known))
+    containing = [other for other in known if name in other] if len(name) > 2 else []
+    matches = containing[:3] or difflib.get_close_matches(name, known, n=1)
+    return f", did you mean {' or '.join(map(repr, matches))}?" if matches else otherwise

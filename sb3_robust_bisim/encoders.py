@@ -136,7 +136,8 @@ class PixelEncoder(BaseFeaturesExtractor):
         if not is_image_space(observation_space, check_channels=False, normalized_image=normalized_image):
             raise ValueError(
                 f"CnnPolicy needs images, the observation space is {observation_space}: use MlpPolicy, or MultiInputPolicy "
-                "for a Dict. For images that are floats already, pass policy_kwargs=dict(normalize_images=False)."
+                "for a Dict. For images that are floats already, put the channels first and pass "
+                "policy_kwargs=dict(normalize_images=False)."
             )
         super().__init__(observation_space, features_dim)
         channels, *size = observation_space.shape

@@ -20,6 +20,7 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer
+from sb3_robust_bisim.cli.errors import UsageError, refusals
 from sb3_robust_bisim.cli.manager import BisimExperimentManager, sample_bisim_sac_params
 from sb3_robust_bisim.cli.report import report
 from sb3_robust_bisim.cli.settings import StoreSettings
@@ -195,7 +196,7 @@ def test_env_kwargs_of_the_command_line_reach_training_and_evaluation(zoo: Zoo, 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--variant", "normed-ir"], "--variant normed-ir: .* has SAC, DBC"),
+        (["--variant", "normed-ir"], "--variant normed-ir: .* has SAC, DBC.*, did you mean 'normed-IR'"),
         (["-params", "bisim_coeff:1"], "-params: unknown key 'bisim_coeff', did you mean 'bisim_coef'"),
     ],
 )
@@ -210,14 +211,20 @@ def test_bad_input_is_refused_before_a_run_folder_exists(zoo: Zoo, arguments: li
     [
         (["-params", "ent_coef:-1"], "ent_coef=-1: it must be a number >= 0"),
         (["--env-kwargs", "noise_multiplier:-2"], "noise_multiplier must be an integer >= 0 .* got -2"),
+        (["--env-kwargs", "noise_multiplyer:3"], "unexpected keyword argument 'noise_multiplyer'"),
     ],
 )
 def test_a_value_that_algorithm_or_task_refuses_leaves_no_run(
     zoo: Zoo, arguments: list[str], message: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(UsageError, match=message):
         zoo("train", "--env", CARTPOLE, *arguments, "-f", str(tmp_path / "logs"))
     assert not list((tmp_path / "logs" / "bisim_sac").iterdir())
+
+
+def test_an_error_in_the_code_of_an_environment_keeps_its_traceback() -> None:
+    with pytest.raises(TypeError, match="has no len"), refusals():
+        len(1)  # type: ignore[arg-type]
 
 
 def _settings(*values: str) -> dict[str, Any]:
@@ -268,6 +275,7 @@ def test_the_error_for_a_task_without_settings_lists_the_tasks_with_settings(zoo
     [
         (["train"], "train: error: --env: name the task."),
         (["enjoy"], "enjoy: error: --env: name the task."),
+        (["train", "--env", "SparseCartPole-v0"], f"no such task, did you mean '{CARTPOLE}'? If your"),
         (["train", "--env", "robust_bisim/SparseCartpole-v0"], f"no such task, did you mean '{CARTPOLE}'? If your"),
         (["train", "--env", "x"], "--env x: no such task. If your package registers it, add --gym-packages"),
     ],

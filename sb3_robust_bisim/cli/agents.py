@@ -17,7 +17,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_robust_bisim.cli.errors import UsageError
+from sb3_robust_bisim.cli.errors import UsageError, refusals
 from sb3_robust_bisim.cli.settings import StoreSettings
 
 
@@ -75,7 +75,8 @@ class Agent:
         """
         hyperparams = deepcopy(self.hyperparams)  # rl-zoo3 removes the wrappers from it
         make = ExperimentManager.default_vec_env_cls
-        return create_test_env(self.env_id, 1, self.stats, seed, None, False, hyperparams, dict(env_kwargs), make)
+        with refusals():
+            return create_test_env(self.env_id, 1, self.stats, seed, None, False, hyperparams, dict(env_kwargs), make)
 
     def load(self, venv: VecEnv, device: str) -> BaseAlgorithm:
         """

@@ -19,7 +19,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_robust_bisim.bisim_sac import BisimSAC
-from sb3_robust_bisim.cli.errors import UsageError
+from sb3_robust_bisim.cli.errors import UsageError, refusals
 from sb3_robust_bisim.cli.record import record_or_explain
 from sb3_robust_bisim.cli.report import report
 from sb3_robust_bisim.cli.zoo_config import check_keys, check_task, entry_of, is_yaml, merged_policy_kwargs, variant_settings
@@ -154,8 +154,9 @@ class BisimExperimentManager(ExperimentManager):
         if self.vec_env_class is SubprocVecEnv:  # ours can be saved, and closed after its workers have ended
             self.vec_env_class = ResumableSubprocVecEnv
         try:
-            return self._set_up()
-        except Exception:  # a value that environment or algorithm refuses leaves no run behind
+            with refusals():
+                return self._set_up()
+        except Exception:  # no run has begun, so it leaves no folder
             if self.made_folder is not None:
                 shutil.rmtree(self.made_folder, ignore_errors=True)
             raise

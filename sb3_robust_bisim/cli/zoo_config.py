@@ -60,7 +60,9 @@ def variant_settings(config: str | Path, env_id: str, *names: str) -> dict[str, 
     settings: dict[str, Any] = {}
     for name in names:
         if name not in general and name not in own:
-            raise UsageError(f"--variant {name}: for {env_id}, {config} has {', '.join({**general, **own}) or 'no variants'}.")
+            names_of_all = ", ".join({**general, **own}) or "no variants"
+            guess = closest(name, {**general, **own}, ".")
+            raise UsageError(f"--variant {name}: for {env_id}, {config} has {names_of_all}{guess}")
         settings = _merged(_merged(settings, general.get(name, {})), own.get(name, {}))
     return {key: value for key, value in _merged(entry, settings).items() if key in settings}
 

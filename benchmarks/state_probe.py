@@ -5,8 +5,8 @@ How much of the true state does the embedding of an agent from pixels hold, in f
 
 All agents look at the same frames. In half of the environments actions are random; each of the others follows one agent and
 takes three of ten actions at random. A small net then learns to predict the true state, as dm_control observes it, from each
-agent's embeddings in front of the training clips. The table has its R² on frames with the held-out clip: 1 is perfect, and 0 is
-no better than the mean. The last line printed is one JSON object.
+agent's embeddings in front of the training clips. The table has its R² on frames with the held-out clip: 1 is perfect, 0 is no
+better than the mean. The last line printed is one JSON object.
 """
 
 import argparse
@@ -39,16 +39,17 @@ def load(folder: Path, env_id: str) -> tuple[BisimSAC, dict[str, Any]]:
     return BisimSAC.load(agent.path, device="cpu", buffer_size=1), agent.env_kwargs
 
 
-def true_state(env: Any) -> np.ndarray:
-    """What dm_control observes of a task from states."""
+def true_state(env: Any) -> dict[str, float]:
+    """What dm_control observes of a task from states, by name."""
     suite = env.unwrapped._env.unwrapped._env
-    return np.concatenate([np.ravel(value) for value in suite.task.get_observation(suite.physics).values()])
+    observed = suite.task.get_observation(suite.physics).items()
+    return {f"{name} {i + 1}": float(value) for name, values in observed for i, value in enumerate(np.ravel(values))}
 
 
-def collect(agents: list[BisimSAC], make: Any, steps: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def collect(agents: list[BisimSAC], make: Any, steps: int, seed: int) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """
     :param make: of the number of environments and a seed
-    :return: frames (N, C, H, W) and true states (N, n), with 2 * steps for each agent
+    :return: frames (N, C, H, W), true states (N, n), with 2 * steps for each agent, and the names of the n numbers
     """
     n = len(agents)
     venv: VecEnv = make(2 * n, seed)
@@ -57,14 +58,14 @@ def collect(agents: list[BisimSAC], make: Any, steps: int, seed: int) -> tuple[n
     frames, states = [], []
     for _ in range(steps):
         frames.append(np.array(obs))
-        states.append([true_state(env) for env in venv.unwrapped.envs])  # type: ignore[attr-defined]
+        states += [true_state(env) for env in venv.unwrapped.envs]  # type: ignore[attr-defined]
         actions = rng.uniform(-1, 1, (2 * n, *venv.action_space.shape)).astype(np.float32)  # type: ignore[misc]
         for i, agent in enumerate(agents):
             if rng.random() >= RANDOM_ACTIONS:
                 actions[i] = agent.predict(np.asarray(obs)[i])[0]
         obs, *_ = venv.step(actions)
     venv.close()
-    return np.concatenate(frames), np.concatenate(states)
+    return np.concatenate(frames), np.array([list(state.values()) for state in states]), list(states[0])
 
 
 @th.no_grad()
@@ -93,13 +94,9 @@ def r2(train: tuple[th.Tensor, np.ndarray], test: tuple[th.Tensor, np.ndarray], 
     return 1 - (error**2).mean(axis=0) / test_state.var(axis=0)
 
 
-def table(scores: dict[str, np.ndarray]) -> str:
-    """Mean over the repetitions, with the standard error of the mean over the state."""
-    width = next(iter(scores.values())).shape[1]
-    lines = [
-        f"| agent | R² | {' | '.join(f'number {i + 1} of the state' for i in range(width))} |",
-        "|---" * (width + 2) + "|",
-    ]
+def table(scores: dict[str, np.ndarray], names: list[str]) -> str:
+    """Means over the repetitions, and the standard error of the mean over the state."""
+    lines = [f"| agent | mean R² | {' | '.join(names)} |", "|---" * (len(names) + 2) + "|"]
     for name, values in sorted(scores.items(), key=lambda item: -item[1].mean()):
         means = values.mean(axis=1)
         error = f" ± {means.std(ddof=1) / np.sqrt(len(means)):.2f}" if len(means) > 1 else ""
@@ -126,17 +123,23 @@ def main() -> None:
 
         return venv
 
+    names: list[str] = []
     models = [model for model, _ in agents.values()]
     scores: dict[str, list[np.ndarray]] = {name: [] for name in agents}
     for seed in tqdm(range(args.repeats), unit="repetition"):
-        frames, states = collect(models, make("train"), args.steps, seed)
-        test_frames, test_states = collect(models, make("eval"), args.steps // 2, 1000 + seed)
+        frames, states, names = collect(models, make("train"), args.steps, seed)
+        test_frames, test_states, _ = collect(models, make("eval"), args.steps // 2, 1000 + seed)
         for name, model in zip(agents, models, strict=True):
             train, test = (embed(model, frames), states), (embed(model, test_frames), test_states)
             scores[name].append(r2(train, test, args.updates, seed))
-    text = table({name: np.array(values) for name, values in scores.items()})
+    text = table({name: np.array(values) for name, values in scores.items()}, names)
     settings = {name: getattr(args, name) for name in ("env", "steps", "updates", "repeats")}
-    result = {**machine(), **settings, "r2": {name: np.array(values).round(3).tolist() for name, values in scores.items()}}
+    result = {
+        **machine(),
+        **settings,
+        "state": names,
+        "r2": {name: np.array(values).round(3).tolist() for name, values in scores.items()},
+    }
     args.out.mkdir(parents=True, exist_ok=True)
     for file, content in ((args.out / "table.md", text), (args.out / "state_probe.json", json.dumps(result, indent=1) + "\n")):
         with atomic_path(file) as temporary:

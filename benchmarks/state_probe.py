@@ -113,8 +113,15 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3, help="with other frames and other nets (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "state_probe", help="folder (default: %(default)s)")
     args = parser.parse_args()
-    agents = {folder.name: load(folder, args.env) for folder in args.folders}
-    env_kwargs = {**next(iter(agents.values()))[1], "distractor": "video"}
+    names_of_folders = [folder.resolve().name for folder in args.folders]
+    if len(set(names_of_folders)) < len(names_of_folders):
+        parser.error(f"folders {' '.join(names_of_folders)}: two have the same name, which would be one row of the table")
+    agents = {name: load(folder, args.env) for name, folder in zip(names_of_folders, args.folders, strict=True)}
+    first = next(iter(agents.values()))[1]
+    for name, (_, of_agent) in agents.items():
+        if of_agent != first:
+            parser.error(f"folder {name}: trained with {of_agent}, the first agent with {first}; compare agents of one task")
+    env_kwargs = {**first, "distractor": "video"}
 
     def make(split: str) -> Any:
         def venv(n_envs: int, seed: int) -> VecEnv:

@@ -191,5 +191,5 @@ def closest(name: str, known: Iterable[str], otherwise: str = ": see the documen
     """The end of a message about a name that is not known: names that contain it, or the closest one."""
     known = list(dict.fromkeys(known))
     containing = [other for other in known if name in other] if len(name) > 2 else []
-    matches = containing[:3] or difflib.get_close_matches(name, known, n=1)
+    matches = difflib.get_close_matches(name, containing, cutoff=0) or difflib.get_close_matches(name, known, n=1)
     return f", did you mean {' or '.join(map(repr, matches))}?" if matches else otherwise

@@ -105,7 +105,7 @@ def test_the_same_settings_are_accepted_where_they_have_a_meaning() -> None:
     ("wrong", "right"),
     [
         ("bisim_coeff", "'bisim_coef'"),
-        ("intrinsic_reward", "'intrinsic_reward_scale' or 'intrinsic_reward_max'"),
+        ("intrinsic_reward", "'intrinsic_reward_max' or 'intrinsic_reward_scale'"),
         ("learning_start", "'learning_starts'"),
     ],
 )

@@ -9,6 +9,7 @@ from argparse import ArgumentParser
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import optuna
 import pytest
@@ -196,7 +197,7 @@ def test_env_kwargs_of_the_command_line_reach_training_and_evaluation(zoo: Zoo, 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--variant", "normed-ir"], "--variant normed-ir: .* has SAC, DBC.*, did you mean 'normed-IR'"),
+        (["--variant", "normed-ir"], "--variant normed-ir: no such variant, did you mean 'normed-IR'.* has SAC, DBC"),
         (["-params", "bisim_coeff:1"], "-params: unknown key 'bisim_coeff', did you mean 'bisim_coef'"),
     ],
 )
@@ -222,9 +223,30 @@ def test_a_value_that_algorithm_or_task_refuses_leaves_no_run(
     assert not list((tmp_path / "logs" / "bisim_sac").iterdir())
 
 
+class Broken(gym.Env):
+    """An environment with an error in its code."""
+
+    def __init__(self) -> None:
+        np.zeros(3) + np.zeros(4)
+
+
 def test_an_error_in_the_code_of_an_environment_keeps_its_traceback() -> None:
-    with pytest.raises(TypeError, match="has no len"), refusals():
-        len(1)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="could not be broadcast") as raised, refusals():
+        Broken()
+    assert not isinstance(raised.value, UsageError)
+
+
+@pytest.mark.parametrize("arguments", [["--no-render"], ["--video", "agent.gif"]])
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("noise_multiplier:-2", "noise_multiplier must be an integer >= 0 .* got -2"),
+        ("noise_multiplyer:3", "argument 'noise_multiplyer' .*Check --env-kwargs"),
+    ],
+)
+def test_enjoy_says_in_one_line_what_the_task_refuses(zoo: Zoo, arguments: list[str], setting: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        zoo("enjoy", "--env", CARTPOLE, "--trained", *arguments, "--env-kwargs", setting)
 
 
 def _settings(*values: str) -> dict[str, Any]:
@@ -234,10 +256,10 @@ def _settings(*values: str) -> dict[str, Any]:
 
 
 def test_a_word_needs_no_quotes_in_a_setting() -> None:
-    words = _settings("distractor:video", "pairs:all", "ent_coef:auto_0.1", "learning_rate:lin_3e-4", "files:clips/a.mp4")
+    words = _settings("distractor:video", "pairs:all", "ent_coef:auto_0.1", "learning_rate:lin_3e-4", "files:~/clips/a.mp4")
     assert words == {
         **{"distractor": "video", "pairs": "all", "ent_coef": "auto_0.1"},  # `all` is a function in Python
-        **{"learning_rate": "lin_3e-4", "files": "clips/a.mp4"},
+        **{"learning_rate": "lin_3e-4", "files": "~/clips/a.mp4"},
     }
     values = _settings("a:1e-3", "b:'video'", "c:None", "d:True", "e:dict(net_arch=[64])", "f:(0, 8)")
     assert values == {"a": 1e-3, "b": "video", "c": None, "d": True, "e": {"net_arch": [64]}, "f": (0, 8)}
@@ -248,12 +270,19 @@ def test_a_setting_that_is_neither_word_nor_value_is_an_error_of_usage(zoo: Zoo,
     for command in ("train", "enjoy", "evaluate"):
         with pytest.raises(SystemExit):
             zoo(command, "--env", CARTPOLE, "-f", str(tmp_path), "--env-kwargs", value)
-        assert f"--env-kwargs {value}: write NAME:VALUE with a word or a Python value" in zoo.output
+        assert f"--env-kwargs {value}: write NAME:VALUE with a word, a path or a Python value" in zoo.output
+
+
+@pytest.mark.parametrize("value", ["false", "TRUE", "none"])
+def test_a_constant_in_another_spelling_is_not_taken_for_a_word(zoo: Zoo, value: str) -> None:
+    with pytest.raises(SystemExit):
+        zoo("train", "--env", CARTPOLE, "--env-kwargs", f"shadows:{value}")
+    assert f"--env-kwargs shadows:{value}: write {value.title()}" in zoo.output
 
 
 def test_a_shell_shows_what_a_command_cannot_do_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["robust-bisim", "train", "--env", CARTPOLE, "--variant", "normed-ir"])
-    with pytest.raises(SystemExit, match=r"^robust-bisim: --variant normed-ir: .* has SAC, DBC"):
+    with pytest.raises(SystemExit, match=r"^robust-bisim: --variant normed-ir: no such variant, .* has SAC, DBC"):
         shell()
 
 

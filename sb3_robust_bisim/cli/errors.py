@@ -1,7 +1,9 @@
 """The error of a command that cannot do what its options ask for."""
 
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 
 class UsageError(ValueError):
@@ -11,16 +13,19 @@ class UsageError(ValueError):
 @contextmanager
 def refusals() -> Iterator[None]:
     """
-    While environments and agents are made from the user's settings, treat a refused value and an unknown argument as errors of
-    usage. Other errors keep their traceback.
+    While environments and agents are made from the user's settings, treat values that this package or SB3 refuses and unknown
+    arguments as errors of usage. Other errors keep their traceback.
 
     :raises UsageError: with the message of the class that refuses
     """
     try:
         yield
-    except ValueError as error:
-        raise UsageError(str(error)) from error
     except TypeError as error:
         if "unexpected keyword argument" not in str(error):
+            raise
+        raise UsageError(f"{error}. Check --env-kwargs, --eval-env-kwargs and the configuration.") from error
+    except ValueError as error:
+        raised_in = Path(traceback.extract_tb(error.__traceback__)[-1].filename)
+        if not {"sb3_robust_bisim", "stable_baselines3"} & set(raised_in.parts):
             raise
         raise UsageError(str(error)) from error

@@ -156,7 +156,7 @@ class BisimExperimentManager(ExperimentManager):
         try:
             with refusals():
                 return self._set_up()
-        except Exception:  # no run has begun, so it leaves no folder
+        except BaseException:  # no run has begun, so it leaves no folder
             if self.made_folder is not None:
                 shutil.rmtree(self.made_folder, ignore_errors=True)
             raise

@@ -7,7 +7,7 @@ from typing import Any
 
 from rl_zoo3.utils import StoreDict
 
-WORD = re.compile(r"[A-Za-z_][\w.+/-]*")
+WORD = re.compile(r"[A-Za-z_~./][\w.+~/-]*")
 CONSTANTS = ("True", "False", "None")
 
 
@@ -27,6 +27,8 @@ class StoreSettings(StoreDict):
         settings: dict[str, Any] = {}
         for argument in values:
             name, _, value = argument.partition(":")
+            if value.title() in CONSTANTS and value not in CONSTANTS:  # as text, "false" would count as true
+                parser.error(f"{option_string} {argument}: write {value.title()}")
             if value.isidentifier() and value not in CONSTANTS:  # rl-zoo3 would take the names of functions for them
                 settings[name] = value
                 continue
@@ -35,6 +37,8 @@ class StoreSettings(StoreDict):
                 settings |= getattr(namespace, self.dest)
             except Exception as error:  # evaluating a value can raise any
                 if not WORD.fullmatch(value):
-                    parser.error(f"{option_string} {argument}: write NAME:VALUE with a word or a Python value ({error})")
+                    parser.error(
+                        f"{option_string} {argument}: write NAME:VALUE with a word, a path or a Python value ({error})"
+                    )
                 settings[name] = value
         setattr(namespace, self.dest, settings)

@@ -25,7 +25,7 @@ from sb3_robust_bisim.bisim_sac import BisimSAC
 from sb3_robust_bisim.checks import closest
 from sb3_robust_bisim.cli.agents import add_agent_arguments, find_file
 from sb3_robust_bisim.cli.enjoy import record_episode, trained_run, trained_tasks
-from sb3_robust_bisim.cli.errors import UsageError
+from sb3_robust_bisim.cli.errors import UsageError, refusals
 from sb3_robust_bisim.cli.evaluate import DESCRIPTION, add_arguments, check_arguments, evaluate
 from sb3_robust_bisim.cli.manager import ALGO, BisimExperimentManager, RunOptions, sample_bisim_sac_params
 from sb3_robust_bisim.cli.record import check_video
@@ -260,7 +260,11 @@ def _enjoy(program: str, arguments: list[str]) -> None:
                 tasks = ", ".join(trained_tasks())
                 parser.error(f"{error}. --trained plays an agent that comes with the package, for {tasks}.")
         options = [*theirs, "-f", found, "--exp-id", str(exp_id), "--env", task]
-        with _replaced(sys, "argv", [program, *options]), _replaced(rl_zoo3.enjoy, "StoreDict", StoreSettings):
+        with (
+            _replaced(sys, "argv", [program, *options]),
+            _replaced(rl_zoo3.enjoy, "StoreDict", StoreSettings),
+            _replaced(rl_zoo3.enjoy, "create_test_env", refusals()(rl_zoo3.enjoy.create_test_env)),
+        ):
             rl_zoo3.enjoy.enjoy()
 
 
@@ -310,8 +314,8 @@ def _parser(program: str, description: str = CHANGED, add_help: bool = False) ->
     parser.add_argument(
         "--num-threads",
         type=int,
-        help="number of CPU threads of torch; -1 leaves the choice to torch, which is faster on an idle machine. The default "
-        "is 1, which is faster beside other work, since torch's threads wait actively and slow each other down. If one of "
+        help="number of CPU threads of torch; -1 leaves the choice to torch, which may be faster on an idle machine. The "
+        "default is 1, which is faster beside other work, since torch's threads wait actively and slow each other down. If one of "
         f"{', '.join(SET_BY_THE_USER)} is set, the default is -1",
     )
     return parser

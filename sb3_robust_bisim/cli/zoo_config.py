@@ -62,7 +62,7 @@ def variant_settings(config: str | Path, env_id: str, *names: str) -> dict[str, 
         if name not in general and name not in own:
             names_of_all = ", ".join({**general, **own}) or "no variants"
             guess = closest(name, {**general, **own}, ".")
-            raise UsageError(f"--variant {name}: for {env_id}, {config} has {names_of_all}{guess}")
+            raise UsageError(f"--variant {name}: no such variant{guess} For {env_id}, {config} has {names_of_all}.")
         settings = _merged(_merged(settings, general.get(name, {})), own.get(name, {}))
     return {key: value for key, value in _merged(entry, settings).items() if key in settings}
 

@@ -315,7 +315,7 @@ def _parser(program: str, description: str = CHANGED, add_help: bool = False) ->
         "--num-threads",
         type=int,
         help="number of CPU threads of torch; -1 leaves the choice to torch, which may be faster on an idle machine. The "
-        "default is 1, which is faster beside other work, since torch's threads wait actively and slow each other down. If one of "
+        "default is 1, which is faster beside other work: torch's threads wait actively and slow each other down. If one of "
         f"{', '.join(SET_BY_THE_USER)} is set, the default is -1",
     )
     return parser

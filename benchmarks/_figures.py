@@ -121,6 +121,7 @@ def _without(*names: str) -> dict[str, float]:
 
 _SELF_PREDICTION = _without("c_r", "bisim_coef", "inverse_dynamics_coef")
 _LONG = {"gradient_steps": 5, "buffer_size": 125_000}
+_SWINGUP_VIDEO = Panel(SWINGUP_PIXELS, variants=("small",), splits=("train", "eval"))
 
 FIGURES = {
     "cartpole": Figure(
@@ -200,7 +201,7 @@ FIGURES = {
     # what random shifts, self-prediction, and the parts of the method contribute from pixels; all but SAC shift images
     "dmc_pixels": Figure(
         {
-            "video": Panel(SWINGUP_PIXELS, variants=("small",), splits=("train", "eval")),
+            "video": _SWINGUP_VIDEO,
             "clean": Panel(SWINGUP_PIXELS, variants=("clean", "small")),
             "ball_in_cup": Panel("robust_bisim/ball_in_cup-catch-pixels-v0", variants=("small",), splits=("train", "eval")),
         },
@@ -226,7 +227,7 @@ FIGURES = {
     ),
     # a million frames, where published agents are compared, and twice the updates
     "dmc_pixels_long": Figure(
-        {"video": Panel(SWINGUP_PIXELS, variants=("small",), splits=("train", "eval"))},
+        {"video": _SWINGUP_VIDEO},
         {
             "self-prediction-shift": Method(("self-prediction",), {**_SELF_PREDICTION, **_LONG}),
             "SAC-shift": Method(("SAC",), _LONG),

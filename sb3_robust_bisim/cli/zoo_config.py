@@ -57,12 +57,14 @@ def variant_settings(config: str | Path, env_id: str, *names: str) -> dict[str, 
     content = _read(config)
     entry = content.get(env_id, {})
     general, own = content.get("variants") or {}, entry.get("variants") or {}
+    known = {**general, **own}
     settings: dict[str, Any] = {}
     for name in names:
-        if name not in general and name not in own:
-            names_of_all = ", ".join({**general, **own}) or "no variants"
-            guess = closest(name, {**general, **own}, ".")
-            raise UsageError(f"--variant {name}: no such variant{guess} For {env_id}, {config} has {names_of_all}.")
+        if name not in known:
+            listed = ", ".join(known) or "no variants"
+            raise UsageError(
+                f"--variant {name}: no such variant{closest(name, known, '.')} For {env_id}, {config} has {listed}."
+            )
         settings = _merged(_merged(settings, general.get(name, {})), own.get(name, {}))
     return {key: value for key, value in _merged(entry, settings).items() if key in settings}
 

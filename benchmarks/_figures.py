@@ -220,6 +220,8 @@ FIGURES = {
             "SAC-shift": Method(("SAC",)),
             "normed-IR-ID-no-metric": Method(("normed-IR-ID", "no-metric"), _without("bisim_coef"), panels=("video",)),
             "normed-IR": Method(("normed-IR",), _without("inverse_dynamics_coef"), panels=("video",)),
+            "normed-ID": Method(("normed-ID",), _BALANCED, panels=("video",)),
+            "IR-ID": Method(("normed-IR-ID",), {**_BALANCED, "norm_constraint": False}, panels=("video",)),
             "DBC-shift": Method(("DBC",), _without("inverse_dynamics_coef"), panels=("video",)),
             "SAC": Method(("SAC",), {"random_shift": 0}, panels=("video",)),
         },

@@ -173,11 +173,8 @@ def train(command: list[str], folder: Path, result_path: Path, identity: dict, c
             return result
         try:
             measured = begin(folder, {**_machine.machine(command[command.index("--device") + 1]), "commit": commit})
-            stopped = learn(command, folder)
+            stopped = learn(command, folder, identity["steps"] - identity["eval_freq"])
             result = {**identity, **measured, **stopped, **collect(folder)}
-            if not stopped and steps_of(result)[-1] + identity["eval_freq"] <= identity["steps"]:
-                raise KeyboardInterrupt  # the zoo ends such a run as if it were complete
-            write(folder / "trained.json", json.dumps(stopped))
             if splits and not stopped:
                 result["final_return_by_split"] = {split: play(folder, identity, split) for split in splits}
         except Exception:  # the other runs go on
@@ -207,8 +204,8 @@ def begin(folder: Path, measured: dict) -> dict:
     return measured
 
 
-def learn(command: list[str], folder: Path) -> dict[str, str]:
-    """Train to the end, unless that has been done; under "stopped" why it ended before."""
+def learn(command: list[str], folder: Path, before_last: int) -> dict[str, str]:
+    """Train past the step ``before_last``, unless that has been done; under "stopped" why it ended before."""
     from sb3_robust_bisim.cli.zoo import main
 
     if (folder / "trained.json").exists():
@@ -221,9 +218,15 @@ def learn(command: list[str], folder: Path) -> dict[str, str]:
             if "training has stopped" not in str(error):
                 raise
             stopped = {"stopped": str(error)}
-    if not stopped and (folder / "checkpoint.pkl").exists():
-        raise KeyboardInterrupt  # likewise: a run that has ended leaves none
+    if not stopped and ((folder / "checkpoint.pkl").exists() or last_evaluation(folder) <= before_last):
+        raise KeyboardInterrupt  # the zoo ends such a run as if it were complete
+    write(folder / "trained.json", json.dumps(stopped))
     return stopped
+
+
+def last_evaluation(folder: Path) -> int:
+    with np.load(run_folder(folder)[0] / "evaluations.npz") as archive:
+        return int(archive["timesteps"][-1])
 
 
 def steps_of(result: dict[str, Any]) -> list[int]:

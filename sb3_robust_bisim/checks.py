@@ -15,8 +15,8 @@ from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.sac.sac import SAC
 
-from sb3_robust_bisim.objective import is_number
 from sb3_robust_bisim.policies import BisimPolicy, MlpPolicy, MultiInputPolicy
+from sb3_robust_bisim.values import is_number, is_whole
 
 # The smallest value of each integer argument
 LEAST = dict(policy_delay=1, initial_gradient_steps=0, batch_size=1, buffer_size=1, target_update_interval=1)
@@ -29,8 +29,8 @@ def check_arguments(model: Any) -> None:
     """
     _require(isinstance(model.bf16, (bool, np.bool_)), model, "bf16", "True or False")
     for name, least in LEAST.items():
-        _require(_is_whole(getattr(model, name), least), model, name, f"an integer >= {least}")
-    _require(_is_whole(model.gradient_steps, -1), model, "gradient_steps", "an integer >= 0, or -1 for one per step")
+        _require(is_whole(getattr(model, name), least), model, name, f"an integer >= {least}")
+    _require(is_whole(model.gradient_steps, -1), model, "gradient_steps", "an integer >= 0, or -1 for one per step")
     _require(is_number(model.learning_starts, 0), model, "learning_starts", "a number >= 0")
     _require(is_number(model.gamma, 0) and model.gamma <= 1, model, "gamma", "in [0, 1]")
     _require(is_number(model.tau, 0) and model.tau <= 1, model, "tau", "in [0, 1]")
@@ -112,7 +112,7 @@ def _check_train_freq(model: Any) -> None:
     value = model.train_freq  # a TrainFreq in a loaded model
     count, unit = value if isinstance(value, tuple) and len(value) == 2 else (value, "step")
     unit = getattr(unit, "value", unit)
-    valid = _is_whole(count, 1) and unit in ("step", "episode")
+    valid = is_whole(count, 1) and unit in ("step", "episode")
     _require(valid, model, "train_freq", 'n, (n, "step") or (n, "episode"), with an integer n >= 1')
     if unit == "episode" and model.n_envs > 1:
         raise ValueError(
@@ -144,7 +144,7 @@ def checked_env(env: Any, verbose: int) -> Any:
 
 
 def _check_random_shift(pad: Any, space: spaces.Space) -> None:
-    if not _is_whole(pad, 0):
+    if not is_whole(pad, 0):
         raise ValueError(f"random_shift={pad!r}: it must be an integer in [0, image size), 0 for none.")
     if pad > 0 and not is_image_space(space):
         raise ValueError(f"random_shift={pad} with observations {space}: it needs images of bytes. Set random_shift=0.")
@@ -161,10 +161,6 @@ def _check_policy_fits(model: Any) -> None:
         raise ValueError(f"policy={name} with observations {space}: {remedy}.")
     if model.policy_class is MlpPolicy and is_image_space(space):
         raise ValueError(f'policy="MlpPolicy" with images {space}: use "CnnPolicy".')
-
-
-def _is_whole(value: Any, least: int) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= least)
 
 
 def _require(condition: Any, model: Any, name: str, remedy: str) -> None:

@@ -122,8 +122,8 @@ def load_agent(
     try:
         model._setup_model()
     except Exception as error:
-        remedy = "Export it again, or check the arguments of load_agent."
-        raise ValueError(f"{file}: no agent can be built from this ({error!r}). {remedy}") from error
+        cause = f"{file}: no agent can be built from this and the arguments of load_agent ({error!r})"
+        raise ValueError(f"{cause}. Check these arguments, or export the agent again.") from error
     targets = _weights_of(model)
     if "ent_coef" in kwargs:  # then the exported coefficient does not count
         weights.pop(LOG_ENT_COEF, None)

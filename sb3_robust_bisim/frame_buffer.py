@@ -102,8 +102,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
     def _allocate(self, n_used: int = 0) -> None:
         """Allocate memory for at least ``n_used`` frames. The system provides it only when it is written to."""
         rows = (self.buffer_size, self.n_envs)
-        # One new frame per transition and one per episode, which may be one step long. The lowest free slots are used first,
-        # so unused slots need no memory. The pool grows only if stacks start with more than one new frame.
+        # One new frame per transition and one per episode, which may be one step long. Slots that are free again are used
+        # before new ones, so unused slots need no memory. The pool grows only if stacks start with more than one new frame.
         n_frames = max(2 * self.buffer_size * self.n_envs + self.n_envs * (self.n_stack + 1), n_used)
         self.actions = np.zeros((*rows, self.action_dim), dtype=self._maybe_cast_dtype(self.action_space.dtype))
         self.rewards = np.zeros(rows, dtype=np.float32)
@@ -281,6 +281,15 @@ def frames_per_observation(venv: VecEnv) -> int:
     """Number of frames that a chain of wrappers stacks; 1 without a VecFrameStack."""
     stack = unwrap_vec_wrapper(venv, VecFrameStack)
     return 1 if stack is None else stack.stacked_obs.n_stack
+
+
+def newest_frames(stacks: np.ndarray, n_stack: int) -> np.ndarray:
+    """
+    :param stacks: (B, n_stack * C, H, W), in colour (C = 3) or grey
+    :param n_stack: frames in a stack
+    :return: (B, 3, H, W), the last frame of each
+    """
+    return stacks[:, -3:] if stacks.shape[1] == 3 * n_stack else stacks[:, -1:].repeat(3, axis=1)
 
 
 def choose_buffer(model: OffPolicyAlgorithm) -> None:

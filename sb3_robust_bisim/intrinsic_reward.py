@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
@@ -30,6 +30,8 @@ class IntrinsicRewardVecEnv(VecEnvWrapper):
 
     :param venv: the vectorised environment
     """
+
+    only_while_learning: ClassVar = ("_bonus",)  # checkpoints leave it out: it holds the agent and its replay buffer
 
     def __init__(self, venv: VecEnv) -> None:
         super().__init__(venv)

@@ -8,6 +8,7 @@ import numpy as np
 from sb3_robust_bisim.latent_models import DYNAMICS
 from sb3_robust_bisim.losses import DISTANCES, ball_radius
 from sb3_robust_bisim.metrics import Metric
+from sb3_robust_bisim.values import is_number
 
 
 @dataclass
@@ -39,8 +40,8 @@ class Objective:
         :param model: a BisimSAC
         :return: its settings
         """
-        if model.c_t is None and not 0 <= model.gamma < 1:
-            raise ValueError(f"gamma={model.gamma}: it must be in [0, 1) when c_t is None, which stands for gamma.")
+        if model.c_t is None and not (is_number(model.gamma, 0) and model.gamma < 1):
+            raise ValueError(f"gamma={model.gamma!r}: it must be in [0, 1) when c_t is None, which stands for gamma.")
         settings = {field.name: getattr(model, field.name) for field in fields(cls)}
         return cls(**{**settings, "c_t": model.gamma if model.c_t is None else model.c_t})
 
@@ -113,22 +114,15 @@ class Objective:
         return self.radius_of(self.reward_range) if self.in_ball else None
 
     def radius_of(self, reward_range: tuple[float, float]) -> float:
-        """The radius that rewards of this range need. Absorbing states pay 0."""
+        """The radius that rewards of this range need."""
+        return ball_radius(self.c_r, self.c_t, self.with_absorbing(reward_range))
+
+    def with_absorbing(self, reward_range: tuple[float, float]) -> tuple[float, float]:
+        """A range of rewards, widened to the 0 that absorbing states pay if the metric has them."""
         r_min, r_max = reward_range
-        if self.metric.absorbing:
-            r_min, r_max = min(r_min, 0.0), max(r_max, 0.0)
-        return ball_radius(self.c_r, self.c_t, (r_min, r_max))
+        return (min(r_min, 0.0), max(r_max, 0.0)) if self.metric.absorbing else (r_min, r_max)
 
     @property
     def ratio_target(self) -> float:
         """c_R / (1 - c_T), where mu_bd / mu_rd converges to (eq:reward-dependence2)."""
         return self.c_r / (1 - self.c_t)
-
-
-def is_number(value: Any, least: float = -np.inf) -> bool:
-    """Whether a value is a finite number (a bool is none) and at least ``least``."""
-    return (
-        isinstance(value, (int, float, np.number))
-        and not isinstance(value, bool)
-        and bool(-np.inf < value < np.inf and value >= least)
-    )

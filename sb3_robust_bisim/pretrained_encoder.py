@@ -21,6 +21,9 @@ class PretrainedEncoder(BaseFeaturesExtractor):
     """
     phi of an agent that :func:`sb3_robust_bisim.export_agent` wrote, with its projection onto the ball.
 
+    A saved model of the other algorithm stores ``path``, not the files. Where they lie elsewhere, pass
+    ``custom_objects=dict(policy_kwargs=...)`` with the new path to its ``load``.
+
     Nothing in its files is executed or imported. No initialisation of a policy, such as PPO's orthogonal one, changes its
     weights.
 

@@ -43,7 +43,8 @@ class Representation(nn.Module):
     :param features_dim: width n of the embedding
     :param action_dim: n_a
     :param objective: its weights may be changed between two updates (``bisim_coef``, ``model_coef``, ``reward_coef``,
-        ``inverse_dynamics_coef`` above 0, ``nll_beta``). They are not saved
+        ``inverse_dynamics_coef`` above 0, ``nll_beta``), as ``model.policy.objective.bisim_coef = 0.1``. Checkpoints keep
+        such a change, ``model.save()`` does not
     """
 
     def __init__(self, features_dim: int, action_dim: int, objective: Objective) -> None:

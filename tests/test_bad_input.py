@@ -77,6 +77,7 @@ def test_what_sac_accepts_is_accepted(name: str, value: Any) -> None:
     ("settings", "message"),
     [
         (dict(gamma=1.0), r"gamma=1.0: it must be in \[0, 1\) when c_t is None"),
+        (dict(gamma="0.99"), r"gamma='0.99': it must be in \[0, 1\) when c_t is None"),
         (dict(c_r=0), "c_r=0: it must be above 0, or norm_constraint=False"),
         (dict(model_coef=0.0), "model_coef=0.0: it must be above 0 where bisim_coef or intrinsic_reward_scale needs"),
         (dict(n_steps=3), "n_steps=3 .* Use n_steps=1"),

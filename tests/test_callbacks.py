@@ -415,7 +415,24 @@ def test_another_algorithm_is_refused() -> None:
         SAC("MlpPolicy", "Pendulum-v1").learn(10**9, EmbeddingCallback())
 
 
-@pytest.mark.parametrize(("name", "value"), [("every", 0), ("every", 2.5), ("n_states", 1)])
+def test_the_value_bound_counts_the_reward_of_absorbing_states(tmp_path: Path) -> None:
+    bounds = []
+    for absorbing in (False, True):
+        env = gym.make("test/Picture-v0", noise=0)
+        folder, distance = tmp_path / str(absorbing), dict(distance="l1", metric_kwargs={"absorbing": absorbing})
+        settings = {**SETTINGS, "reward_range": (-2.0, -1.0), "norm_constraint": False, "c_t": 0.5, "gamma": 0.9, **distance}
+        BisimSAC("CnnPolicy", env, tensorboard_log=str(folder), **settings).learn(1, ValueBoundCallback(n_states=10))
+        bounds.append(scalars(folder, "bisim/value_bound")[0])
+    # the same distances; what c_T < gamma leaves out grows with the span of the rewards, 1 or 2
+    assert bounds[1] > 1.5 * bounds[0]
+
+
+@pytest.mark.parametrize("every", [np.int64(5), 5])
+def test_integers_of_numpy_are_integers(every: Any) -> None:
+    assert DenoisingFactorCallback(every=every).every == 5
+
+
+@pytest.mark.parametrize(("name", "value"), [("every", 0), ("every", 2.5), ("every", True), ("n_states", 1)])
 def test_callback_arguments_outside_their_range_are_refused(name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=f"{name}={value}"):
         EmbeddingCallback(**{name: value})

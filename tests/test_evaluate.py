@@ -10,6 +10,7 @@ import gymnasium as gym
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 from rl_zoo3.utils import EnvironmentName
 
@@ -18,6 +19,7 @@ from sb3_robust_bisim.cli.agents import latest_run
 from sb3_robust_bisim.cli.distractors import Noise, Scene, distractors_of
 from sb3_robust_bisim.cli.scores import Score
 from sb3_robust_bisim.cli.zoo import main
+from sb3_robust_bisim.cli.zoo_config import DEFAULT_CONFIG
 
 CARTPOLE, PIXELS = "robust_bisim/SparseCartPole-v0", "robust_bisim/cartpole-swingup-pixels-v0"
 
@@ -165,10 +167,38 @@ def test_enjoy_writes_a_video_of_one_episode_of_a_state_agent(
     assert not list(tmp_path.rglob(".*"))  # no temporary file is left
 
 
+class Unseen(gym.Env):
+    """A task that cannot be drawn."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, **_: Any) -> tuple[np.ndarray, dict]:
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        return np.zeros(2, np.float32), 0.0, True, False, {}
+
+
+def test_evaluate_of_a_task_that_cannot_be_drawn_says_so_in_its_table(tmp_path: Path) -> None:
+    gym.register("test/Unseen-v0", Unseen)
+    content = yaml.safe_load(DEFAULT_CONFIG.read_text())
+    content["test/Unseen-v0"] = {**content[CARTPOLE], "env_kwargs": {}, "eval_env_kwargs": {}}
+    config = tmp_path / "config.yml"
+    config.write_text(yaml.dump(content))
+    settings = ("-params", "learning_starts:10", "batch_size:4", "initial_gradient_steps:1")
+    common = ("--env", "test/Unseen-v0", "-f", str(tmp_path / "logs"))
+    main(["train", *common, "-conf", str(config), "-n", "20", "--eval-freq", "-1", *settings])
+    main(["evaluate", *common, "--out", str(tmp_path / "out"), "--n-episodes", "2"])
+    text = (tmp_path / "out" / "evaluation.md").read_text()
+    assert "Video: not recorded, " in text
+    assert "render_mode" in text
+
+
 def test_enjoy_writes_a_video_of_a_pixel_agent_in_front_of_its_background(pixel_logs: str, tmp_path: Path) -> None:
     enjoy = ["enjoy", "--env", PIXELS, "-f", pixel_logs, "--video"]
     main([*enjoy, str(tmp_path / "noise.mp4")])
-    main([*enjoy, str(tmp_path / "clean.gif"), "--env-kwargs", "distractor:'none'"])
+    main([*enjoy, str(tmp_path / "clean.gif"), "--env-kwargs", "distractor:none"])
     noise = imageio.get_reader(tmp_path / "noise.mp4")
     assert noise.count_frames() == 10
     with Image.open(tmp_path / "clean.gif") as gif:

@@ -15,30 +15,31 @@ from sb3_robust_bisim import BisimSAC
 PACKAGE = Path(sb3_robust_bisim.__file__).parent
 # What each module or folder may import; `runs` and `callbacks` serve any model, `cli` may know everything
 MAY_KNOW: dict[str, set[str]] = {
+    "values": set(),
     "losses": set(),
     "augmentation": set(),
     "frame_buffer": {"runs"},
     "intrinsic_reward": set(),
     "update_log": set(),
     "data_checks": set(),
-    "envs": {"runs"},
+    "envs": {"runs", "values"},
     "theory": set(),
-    "runs": set(),
+    "runs": {"values"},
     "encoders": {"losses"},
     "latent_models": {"losses"},
-    "objective": {"latent_models", "losses", "metrics"},
+    "objective": {"latent_models", "losses", "metrics", "values"},
     "representation": {"latent_models", "losses", "metrics", "objective"},
     "metrics": {"losses"},
     "heads": {"encoders"},
     "policies": {"augmentation", "encoders", "heads", "latent_models", "objective", "representation"},
-    "checks": {"objective", "policies"},
+    "checks": {"policies", "values"},
     "bisim_sac": {
         *("checks", "data_checks", "frame_buffer", "heads", "intrinsic_reward", "objective", "policies", "runs", "update_log"),
     },
     "agent_files": {"encoders", "frame_buffer", "policies", "runs"},
     "export": {"agent_files", "bisim_sac", "checks"},
     "pretrained_encoder": {"agent_files", "encoders"},
-    "callbacks": {"bisim_sac", "encoders", "envs", "frame_buffer", "losses", "theory"},
+    "callbacks": {"bisim_sac", "encoders", "envs", "frame_buffer", "losses", "theory", "values"},
     "cli": {"bisim_sac", "callbacks", "checks", "envs", "export", "frame_buffer", "runs"},
 }
 

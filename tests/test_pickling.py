@@ -12,7 +12,9 @@ from gymnasium.wrappers import RecordEpisodeStatistics
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
+from sb3_robust_bisim import BisimSAC, IntrinsicRewardVecEnv
 from sb3_robust_bisim.envs.opengl import import_suite
+from sb3_robust_bisim.intrinsic_reward import bound
 from sb3_robust_bisim.runs import ResumableSubprocVecEnv
 from sb3_robust_bisim.runs.pickling import NotSaveable, WorkerEnded, check_environments, dumps
 
@@ -139,6 +141,19 @@ def test_an_environment_that_cannot_be_pickled_is_named_with_what_to_implement(v
     venv.reset()  # the refusal has not ended the worker
     venv.close()
     check_environments(venv_class([partial(noisy_pendulum, Relocked)]))
+
+
+def test_the_pickle_of_an_environment_does_not_hold_the_agent_whose_bonus_is_bound_to_it() -> None:
+    sizes = []
+    for buffer_size in (100, 100_000):
+        model = BisimSAC("MlpPolicy", "Pendulum-v1", intrinsic_reward_scale=1.0, buffer_size=buffer_size)
+        assert isinstance(model.env, IntrinsicRewardVecEnv)
+        with bound(model.env, model._intrinsic_reward):
+            pickled = dumps(model.env)
+            assert model.env._bonus is not None
+        assert pickle.loads(pickled)._bonus is None
+        sizes.append(len(pickled))
+    assert abs(sizes[1] - sizes[0]) < 100
 
 
 def test_sb3s_environments_in_other_processes_are_refused_with_the_class_to_use() -> None:

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from stable_baselines3.common.env_util import make_vec_env
@@ -224,6 +225,28 @@ def test_a_run_that_broke_off_does_not_hide_the_other_runs(tmp_path) -> None:
     assert (row["runs"], row["stopped"]) == (2, 1)
     assert row["final_return_eval"] == [pytest.approx(sum(recorded["final_return_by_split"]["eval"]) / 20, rel=0.01)]
     assert "Broke off" in (folder / "table.md").read_text()
+
+
+def test_a_training_is_kept_where_reading_its_results_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    import reproduce as sweep
+
+    def zoo(command: list[str]) -> None:
+        trainings.append(command)
+        run = tmp_path / "run" / "bisim_sac" / "task_1"
+        (run / "task").mkdir(parents=True)
+        (run / "task" / "config.yml").write_text("{}")
+        np.savez(run / "evaluations.npz", timesteps=[50, 100], results=[[1.0], [2.0]])
+
+    trainings: list[list[str]] = []
+    monkeypatch.setattr("sb3_robust_bisim.cli.zoo.main", zoo)
+    read = sweep.collect
+    run = (["--device", "cpu"], tmp_path / "run", tmp_path / "run.json", {"steps": 100, "eval_freq": 50}, "commit", ())
+    monkeypatch.setattr(sweep, "collect", lambda folder: 1 / 0)
+    assert "ZeroDivisionError" in sweep.train(*run)["failed"]
+    monkeypatch.setattr(sweep, "collect", read)
+    assert [evaluation["step"] for evaluation in sweep.train(*run)["evaluations"]] == [50, 100]
+    assert len(trainings) == 1
 
 
 def test_a_folder_that_cannot_be_written_is_named_before_the_first_run(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:

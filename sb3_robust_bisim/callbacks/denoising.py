@@ -13,6 +13,7 @@ from sb3_robust_bisim.callbacks.diagnostic import EnvironmentCallback, embed, un
 from sb3_robust_bisim.envs.noise import NoiseObservation
 from sb3_robust_bisim.envs.pixels import PixelTask
 from sb3_robust_bisim.frame_buffer import frames_per_observation
+from sb3_robust_bisim.values import is_whole
 
 _STRIDE = 4  # steps between two anchors, because neighbours are nearly the same state
 
@@ -67,7 +68,7 @@ class DenoisingFactorCallback(EnvironmentCallback):
         eval_env_kwargs: dict[str, Any] | None = None,
     ) -> None:
         super().__init__(every, n_states, env_id, env_kwargs, seed, verbose)
-        if not isinstance(n_positives, int) or n_positives < 1:
+        if not is_whole(n_positives, 1):
             raise ValueError(f"n_positives={n_positives!r}: {type(self).__name__} needs an integer >= 1.")
         self.n_positives = n_positives
         self._held_out: DenoisingFactorCallback | None = None

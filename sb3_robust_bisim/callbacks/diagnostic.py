@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack
 from sb3_robust_bisim.bisim_sac import BisimSAC
 from sb3_robust_bisim.encoders import Encoded
 from sb3_robust_bisim.frame_buffer import frames_per_observation
+from sb3_robust_bisim.values import is_whole
 
 LONGEST_WALK = 100_000  # steps of one measurement, far more than it needs if episodes end
 NOT_FOR_FIGURES = ("stdout", "log", "json", "csv")
@@ -39,7 +40,7 @@ class DiagnosticCallback(BaseCallback):
     def __init__(self, every: int = 5000, n_states: int = 500, verbose: int = 0) -> None:
         super().__init__(verbose)
         for name, value, lowest in (("every", every, 1), ("n_states", n_states, 2)):
-            if not isinstance(value, int) or value < lowest:
+            if not is_whole(value, lowest):
                 raise ValueError(f"{name}={value!r}: {type(self).__name__} needs an integer >= {lowest}.")
         self.every = every
         self.n_states = n_states

@@ -10,7 +10,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_robust_bisim.callbacks.diagnostic import DiagnosticCallback, embed, new_axes
-from sb3_robust_bisim.frame_buffer import frames_per_observation
+from sb3_robust_bisim.frame_buffer import frames_per_observation, newest_frames
 
 
 class EmbeddingCallback(DiagnosticCallback):
@@ -68,9 +68,8 @@ class EmbeddingCallback(DiagnosticCallback):
         """The newest frame of each stack, (B, 3, H, W) in [0, 1]; None if there are no images."""
         if isinstance(obs, dict) or not is_image_space(self.model.observation_space):
             return None
-        in_colour = obs.shape[1] == 3 * frames_per_observation(self.training_env)
-        newest = obs[:, -3:] if in_colour else obs[:, -1:].repeat(1, 3, 1, 1)
-        return (newest.float() / 255).clamp(0, 1)
+        newest = newest_frames(obs.cpu().numpy(), frames_per_observation(self.training_env))
+        return (th.as_tensor(newest).float() / 255).clamp(0, 1)
 
 
 def _pca_figure(z: th.Tensor, values: th.Tensor) -> Figure:

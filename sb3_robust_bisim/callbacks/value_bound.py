@@ -52,8 +52,9 @@ class ValueBoundCallback(EnvironmentCallback):
         first, second = np.triu_indices(len(keep), 1)
         distance = pairwise_distance(z[first], z[second], self.model.distance).mean(dim=1).cpu().double().numpy()
         gap = np.abs(returns[keep][first] - returns[keep][second])
-        r_min, r_max = self.model.reward_range
-        bound = self._bound(distance, self.model.c_r, self.model.policy.objective.c_t, self.model.gamma, r_max - r_min)
+        objective = self.model.policy.objective
+        r_min, r_max = objective.with_absorbing(self.model.reward_range)
+        bound = self._bound(distance, self.model.c_r, objective.c_t, self.model.gamma, r_max - r_min)
         self.logger.record("bisim/value_bound_violations", float((gap > bound).mean()))
         self.logger.record("bisim/value_gap", float(gap.mean()))
         self.logger.record("bisim/value_bound", float(bound.mean()))

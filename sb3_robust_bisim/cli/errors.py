@@ -3,7 +3,6 @@
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 
 class UsageError(ValueError):
@@ -25,7 +24,7 @@ def refusals() -> Iterator[None]:
             raise
         raise UsageError(f"{error}. Check --env-kwargs, --eval-env-kwargs and the configuration.") from error
     except ValueError as error:
-        raised_in = Path(traceback.extract_tb(error.__traceback__)[-1].filename)
-        if not {"sb3_robust_bisim", "stable_baselines3"} & set(raised_in.parts):
+        *_, (raising_frame, _) = traceback.walk_tb(error.__traceback__)
+        if raising_frame.f_globals["__name__"].partition(".")[0] not in ("sb3_robust_bisim", "stable_baselines3"):
             raise
         raise UsageError(str(error)) from error

@@ -153,9 +153,10 @@ def _video(model: BaseAlgorithm, agent: Agent, env_kwargs: dict[str, Any], score
 
 
 def _settings(agent: Agent, env_kwargs: dict[str, Any], args: argparse.Namespace) -> str:
-    """Fingerprint of everything that the numbers depend on."""
-    weights = hashlib.sha256(agent.path.read_bytes()).hexdigest()
-    everything = [weights, agent.env_id, env_kwargs, args.seed, args.n_episodes, args.n_states]
+    """Fingerprint of what the numbers depend on, except for the content of the user's clips."""
+    files = [agent.path, Path(agent.stats or agent.path.parent, "vecnormalize.pkl")]
+    read = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files if file.is_file()]
+    everything = [*read, agent.env_id, env_kwargs, args.seed, args.n_episodes, args.n_states]
     return hashlib.sha256(_json(everything).encode()).hexdigest()[:16]
 
 

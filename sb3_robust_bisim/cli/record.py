@@ -7,13 +7,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from PIL import Image
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_robust_bisim.frame_buffer import frames_per_observation
+from sb3_robust_bisim.frame_buffer import frames_per_observation, newest_frames
 from sb3_robust_bisim.runs.atomic import atomic_path
 
 COLUMNS, ROWS = 8, 4
@@ -41,18 +42,18 @@ def record_or_explain(model: BaseAlgorithm, make_venv: Callable[[], VecEnv], fol
     :param model: see :func:`record`
     :param make_venv: makes the environment of :func:`record`
     :param folder: see :func:`record`
-    :return: the files and the return, or the reason why there are none: a missing package, or no OpenGL
+    :return: the files and the return, or the reason why there are none: a missing package, no OpenGL, or a task that renders
+        nothing
     """
     try:
         _imageio()
     except ImportError as error:
         return f"not recorded, {error}"
     try:
-        venv = make_venv()
-    except RuntimeError as error:
+        with closing(make_venv()) as venv:
+            paths, total_reward = record(model, venv, folder)
+    except (RuntimeError, ValueError, TypeError, gym.error.Error) as error:
         return f"not recorded, {error}"
-    with closing(venv):
-        paths, total_reward = record(model, venv, folder)
     return f"{' '.join(map(str, paths))}, one episode with return {total_reward:.1f}"
 
 
@@ -95,7 +96,7 @@ def play(model: BaseAlgorithm, venv: VecEnv) -> Episode:
             raise ValueError('The task renders no frames: it needs render_mode="rgb_array" in its metadata.')
         episode.shown.append(frame)
         if from_pixels:
-            episode.seen.append(_newest_frame(np.asarray(obs)[0], n_stack))
+            episode.seen.append(_newest_frame(np.asarray(obs), n_stack))
         action, _ = model.predict(obs, deterministic=True)  # type: ignore[arg-type]
         obs, rewards, dones, _ = venv.step(action)
         episode.total_reward += float(rewards[0])
@@ -149,8 +150,8 @@ def contact_sheet(frames: list[np.ndarray]) -> np.ndarray:
     return np.concatenate(rows)
 
 
-def _newest_frame(stack: np.ndarray, n_stack: int) -> np.ndarray:
-    """The newest frame of a stack, RGB or grey, channels first or last, as (H, W, 3)."""
-    if stack.shape[0] < stack.shape[-1]:
-        stack = stack.transpose(1, 2, 0)
-    return stack[..., -3:] if stack.shape[-1] == 3 * n_stack else stack[..., -1:].repeat(3, axis=-1)
+def _newest_frame(stacks: np.ndarray, n_stack: int) -> np.ndarray:
+    """The newest frame of the first stack, channels first or last, as (H, W, 3)."""
+    if stacks.shape[1] > stacks.shape[-1]:
+        stacks = np.moveaxis(stacks, -1, 1)
+    return newest_frames(stacks[:1], n_stack)[0].transpose(1, 2, 0)

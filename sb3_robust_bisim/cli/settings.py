@@ -27,7 +27,7 @@ class StoreSettings(StoreDict):
         settings: dict[str, Any] = {}
         for argument in values:
             name, _, value = argument.partition(":")
-            if value.title() in CONSTANTS and value not in CONSTANTS:  # as text, "false" would count as true
+            if value.title() in ("True", "False") and value not in CONSTANTS:  # as text, "false" would count as true
                 parser.error(f"{option_string} {argument}: write {value.title()}")
             if value.isidentifier() and value not in CONSTANTS:  # rl-zoo3 would take the names of functions for them
                 settings[name] = value

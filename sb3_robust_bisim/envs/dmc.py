@@ -5,7 +5,7 @@ The packages of the extra ``dmc`` are imported when an environment is made, so t
 """
 
 from abc import abstractmethod
-from typing import TYPE_CHECKING, Any, SupportsIndex
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +14,7 @@ from gymnasium.spaces.utils import flatten, flatten_space
 
 from sb3_robust_bisim.envs.noise import NoisyTask
 from sb3_robust_bisim.envs.opengl import import_suite
+from sb3_robust_bisim.values import is_whole
 
 if TYPE_CHECKING:
     from sb3_robust_bisim.envs.camera import Camera
@@ -282,5 +283,5 @@ def check_integer(name: str, value: int, highest: int) -> None:
     :param highest: largest value allowed
     :raises ValueError: unless the value is an integer in [1, highest]
     """
-    if isinstance(value, bool) or not isinstance(value, SupportsIndex) or not 1 <= value <= highest:
+    if not is_whole(value, 1, highest):
         raise ValueError(f"{name} must be an integer in [1, {highest}], got {value!r}")

@@ -1,12 +1,14 @@
 """The distraction of the paper's Gym tasks: noise dimensions in every observation, appended or mixed with the state."""
 
 import math
-from typing import Any, SupportsFloat, SupportsIndex
+from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
+
+from sb3_robust_bisim.values import is_whole
 
 # The noise is a child stream of the reset seed. Its number (the letters "NOIS") is too large to be reached by
 # ``SeedSequence.spawn``, which counts from 0. In the same way, the projection ("PROJ") is a child stream of its own seed.
@@ -29,7 +31,7 @@ def check_noise(
     :param projection_seed: seed of the mixing matrix
     :raises ValueError: if one of them has the wrong type or is outside its range
     """
-    if not _is_natural(noise_multiplier):
+    if not is_whole(noise_multiplier, 0):
         raise ValueError(f"noise_multiplier must be an integer >= 0 (0: no noise), got {noise_multiplier!r}")
     if not isinstance(noise_std, SupportsFloat) or not 0 <= noise_std < math.inf:
         raise ValueError(f"noise_std must be a finite number >= 0, got {noise_std!r}")
@@ -37,14 +39,10 @@ def check_noise(
         raise ValueError(f"noise_mean must be a finite number (0: noise around zero), got {noise_mean!r}")
     if not isinstance(random_projection, bool):
         raise ValueError(f"random_projection must be True or False, got {random_projection!r}")
-    if not _is_natural(projection_seed):
+    if not is_whole(projection_seed, 0):
         raise ValueError(
             f"projection_seed must be an integer >= 0, the same in training and evaluation, got {projection_seed!r}"
         )
-
-
-def _is_natural(value: Any) -> bool:
-    return not isinstance(value, bool) and isinstance(value, SupportsIndex) and value.__index__() >= 0
 
 
 def _draw_projection(size: int, seed: int) -> np.ndarray:

@@ -19,7 +19,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch as th
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -29,6 +28,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_robust_bisim.runs.hashed_file import damage, opened, previous, replaced
 from sb3_robust_bisim.runs.pickling import Pickler, check_environments, generator_states, restore_generators
+from sb3_robust_bisim.values import is_whole
 
 
 class Checkpoint(BaseCallback):
@@ -45,7 +45,7 @@ class Checkpoint(BaseCallback):
 
     def __init__(self, path: str | Path, every: int, context: Any = None, about: dict[str, Any] | None = None) -> None:
         super().__init__()
-        if not isinstance(every, (int, np.integer)) or isinstance(every, bool) or every < 1:
+        if not is_whole(every, 1):
             raise ValueError(f"every={every!r}: it must be an integer >= 1, the environment steps between two checkpoints.")
         self.path = Path(path)
         self.every = every

@@ -49,8 +49,11 @@ class Pickler(cloudpickle.Pickler):
             return ProgressBarCallback, ()
         if isinstance(obj, BaseCallback):  # except the local and global variables of learn()
             return _bare, (type(obj), {"locals": {}, "globals": {}}), _without(obj, "locals", "globals"), None, None, _fill
-        if isinstance(obj, VecEnvWrapper):  # except the members of its class; VecNormalize would drop its environment
-            return _bare_wrapper, (type(obj),), _without(obj, "class_attributes"), None, None, _fill
+        if isinstance(obj, VecEnvWrapper):
+            # except the members of its class, and what learn() sets again; VecNormalize would drop its environment
+            state = _without(obj, "class_attributes")
+            state |= dict.fromkeys(getattr(type(obj), "only_while_learning", ()))
+            return _bare_wrapper, (type(obj),), state, None, None, _fill
         if isinstance(obj, SubprocVecEnv) and not isinstance(obj, ResumableSubprocVecEnv):
             raise NotSaveable(
                 "SubprocVecEnv keeps its environments in other processes: replace it with "
@@ -178,10 +181,13 @@ class _Resumable(gym.Wrapper):
         :return: pickle of the environment and the random generators, or why there is none; an exception would end the worker
         """
         try:
-            check_environments(self.env)
-        except NotSaveable as error:
-            return str(error)
-        return dumps((self, generator_states(th.device("cpu"))))
+            return dumps((self, generator_states(th.device("cpu"))))
+        except Exception as error:  # as in check_environments, which finds the culprit
+            try:
+                check_environments(self.env)
+            except NotSaveable as named:
+                return str(named)
+            return f"An environment cannot be saved in the middle of an episode ({error})."
 
 
 def _resumable(env_fn: Callable[[], gym.Env]) -> gym.Env:

@@ -10,6 +10,7 @@ from typing import Any
 
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
 _SWITCHED_OFF = ("disable", "disabled", "off", "false", "0")
+_chosen_before = ""  # what an earlier call wrote to MUJOCO_GL
 _INSTALL = (
     "On Debian and Ubuntu install EGL with `apt-get install libegl1 libgl1 libgl1-mesa-dri` "
     "(it needs neither a GPU nor a display), or OSMesa with `apt-get install libosmesa6`"
@@ -29,13 +30,15 @@ def import_suite(rendering: bool) -> None:
     missing = [name for name in ("mujoco", "dm_control", "shimmy") if importlib.util.find_spec(name) is None]
     if missing:
         raise ImportError(f"DeepMind Control needs {', '.join(missing)}: install it with `pip install sb3_robust_bisim[dmc]`")
+    global _chosen_before
     chosen_here = False
     if sys.platform == "linux":
         wanted = os.environ.get("MUJOCO_GL", "").strip().lower()
-        _check_backend(wanted, rendering)
-        chosen_here = not wanted
+        if wanted != _chosen_before:
+            _check_backend(wanted, rendering)
+        chosen_here = wanted in ("", _chosen_before)
         if chosen_here:
-            os.environ["MUJOCO_GL"] = _choose_backend(rendering)
+            os.environ["MUJOCO_GL"] = _chosen_before = _choose_backend(rendering)
     try:
         loaded = sys.modules.get("dm_control._render")
         if chosen_here and loaded is not None and loaded.BACKEND not in _LIBRARIES and not os.environ.get("DISPLAY"):

@@ -4,8 +4,8 @@ of video, it is the mean of the final agent's 20 episodes with the held-out clip
 
     python benchmarks/overview.py       # replaces the table in docs/choosing.md
 
-Bold: the highest mean of a column, and every mean that is at least as high once its own standard error is added;
-none if that is a single run.
+Bold: the highest mean of a column, and every mean less than one of its own standard errors below it; none if that is a single
+run.
 """
 
 import argparse

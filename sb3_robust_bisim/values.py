@@ -1,6 +1,6 @@
 """What counts as a number where an argument is checked; a bool is none."""
 
-from typing import Any, SupportsIndex
+from typing import Any
 
 import numpy as np
 
@@ -13,5 +13,5 @@ def is_number(value: Any, least: float = -np.inf) -> bool:
 
 def is_whole(value: Any, least: int, most: float = np.inf) -> bool:
     """Whether a value is an integer from ``least`` to ``most``."""
-    is_integer = isinstance(value, SupportsIndex) and not isinstance(value, (bool, np.bool_))
-    return is_integer and bool(least <= value.__index__() <= most)
+    is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    return is_integer and bool(least <= value <= most)

@@ -85,6 +85,7 @@ def test_what_sac_accepts_is_accepted(name: str, value: Any) -> None:
         (dict(n_steps=3, replay_buffer_kwargs=dict(n_steps=1)), "n_steps=3 .* Use n_steps=1"),
         (dict(replay_buffer_class=NStepReplayBuffer), "NStepReplayBuffer"),
         (dict(gamma=1.5, c_t=0.9), r"gamma=1.5: it must be in \[0, 1\]"),
+        (dict(batch_size=np.array([8, 16])), r"batch_size=array\(\[ 8, 16\]\): it must be an integer >= 1"),
         (
             dict(policy_kwargs=dict(features_extractor_kwargs=dict(n_layers=0))),
             "n_layers=0: an encoder needs at least one layer",

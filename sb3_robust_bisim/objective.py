@@ -41,7 +41,7 @@ class Objective:
         :return: its settings
         """
         if model.c_t is None and not (is_number(model.gamma, 0) and model.gamma < 1):
-            raise ValueError(f"gamma={model.gamma!r}: it must be in [0, 1) when c_t is None, which stands for gamma.")
+            raise ValueError(f"gamma={model.gamma!r}: it must be a number in [0, 1), because c_t=None takes its value.")
         settings = {field.name: getattr(model, field.name) for field in fields(cls)}
         return cls(**{**settings, "c_t": model.gamma if model.c_t is None else model.c_t})
 
@@ -56,7 +56,8 @@ class Objective:
             )
         remedy = "above 0 where bisim_coef or intrinsic_reward_scale needs the dynamics model"
         self._require(self.model_coef != 0 or not self.needs_model, "model_coef", remedy)
-        self._require(is_number(self.c_t, 0) and self.c_t < 1, "c_t", "None (gamma) or in [0, 1), else no metric exists")
+        remedy = "None (gamma) or a number in [0, 1), else no metric exists"
+        self._require(is_number(self.c_t, 0) and self.c_t < 1, "c_t", remedy)
         ordered = bool(
             isinstance(self.reward_range, (tuple, list))
             and len(self.reward_range) == 2
@@ -70,7 +71,7 @@ class Objective:
         self._require(not point, "c_r", "above 0, or norm_constraint=False: the ball is a point")
         self._require(self.distance in tuple(DISTANCES), "distance", f"one of {', '.join(DISTANCES)}")
         self._require(self.dynamics in DYNAMICS, "dynamics", f"one of {', '.join(DYNAMICS)}")
-        self._require(is_number(self.nll_beta, 0) and self.nll_beta <= 1, "nll_beta", "in [0, 1]")
+        self._require(is_number(self.nll_beta, 0) and self.nll_beta <= 1, "nll_beta", "a number in [0, 1]")
         on_sphere = self.distance != "cosine" or self.norm_constraint == "sphere"
         self._require(on_sphere, "distance", 'another one, or norm_constraint="sphere": it is meant for unit vectors')
         known = [field.name for field in fields(Metric)][3:]

@@ -76,15 +76,15 @@ def test_what_sac_accepts_is_accepted(name: str, value: Any) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (dict(gamma=1.0), r"gamma=1.0: it must be in \[0, 1\) when c_t is None"),
-        (dict(gamma="0.99"), r"gamma='0.99': it must be in \[0, 1\) when c_t is None"),
+        (dict(gamma=1.0), r"gamma=1.0: it must be a number in \[0, 1\), because c_t=None takes"),
+        (dict(gamma="0.99"), r"gamma='0.99': it must be a number in \[0, 1\), because c_t=None takes"),
         (dict(c_r=0), "c_r=0: it must be above 0, or norm_constraint=False"),
         (dict(model_coef=0.0), "model_coef=0.0: it must be above 0 where bisim_coef or intrinsic_reward_scale needs"),
         (dict(n_steps=3), "n_steps=3 .* Use n_steps=1"),
         (dict(replay_buffer_kwargs=dict(n_steps=3)), "n_steps=3 .* Use n_steps=1"),
         (dict(n_steps=3, replay_buffer_kwargs=dict(n_steps=1)), "n_steps=3 .* Use n_steps=1"),
         (dict(replay_buffer_class=NStepReplayBuffer), "NStepReplayBuffer"),
-        (dict(gamma=1.5, c_t=0.9), r"gamma=1.5: it must be in \[0, 1\]"),
+        (dict(gamma=1.5, c_t=0.9), r"gamma=1.5: it must be a number in \[0, 1\]"),
         (dict(batch_size=np.array([8, 16])), r"batch_size=array\(\[ 8, 16\]\): it must be an integer >= 1"),
         (
             dict(policy_kwargs=dict(features_extractor_kwargs=dict(n_layers=0))),

@@ -249,7 +249,7 @@ def test_a_reward_loss_alone_is_trained_too() -> None:
         (dict(policy_delay=True), "policy_delay=True: it must be an integer >= 1"),
         (dict(distance="cosine"), "distance='cosine': it must be another one, or norm_constraint=\"sphere\""),
         (dict(norm_constraint="cube"), "norm_constraint='cube': it must be True, False or \"sphere\""),
-        (dict(nll_beta=2.0), r"nll_beta=2\.0: it must be in \[0, 1\]"),
+        (dict(nll_beta=2.0), r"nll_beta=2\.0: it must be a number in \[0, 1\]"),
         (dict(reward_coef=-1.0), r"reward_coef=-1\.0: it must be None or a finite number >= 0"),
     ],
 )

@@ -100,7 +100,7 @@ def test_train_evaluates_in_the_standard_task_and_reports_and_resumes_and_plays(
     # every step pays 1 in the standard task, and almost no step does in the sparse one
     np.testing.assert_array_equal(evaluations["results"], evaluations["ep_lengths"])
     assert f"before training (step 40): {evaluations['results'][0].mean():.1f}" in output
-    assert f"after training (step 120): {evaluations['results'][-1].mean():.1f}" in output
+    assert f"last (step 120): {evaluations['results'][-1].mean():.1f}" in output
     assert (run / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
     folder = run / "robust_bisim-SparseCartPole-v0"
     assert yaml.unsafe_load((folder / "args.yml").read_text())["variant"] == ["normed-ID"]
@@ -341,9 +341,7 @@ def test_a_checkpoint_that_could_not_be_written_is_refused_at_once(zoo: Zoo, fil
     assert message in zoo.output
 
 
-@pytest.mark.parametrize(
-    ("starts", "last"), [(40, "still before training (step 40): 2.0"), (30, "after training (step 40): 2.0")]
-)
+@pytest.mark.parametrize(("starts", "last"), [(40, "still before training (step 40): 2.0"), (30, "last (step 40): 2.0")])
 def test_the_report_calls_an_agent_trained_only_after_training(
     starts: int, last: str, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

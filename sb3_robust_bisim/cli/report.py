@@ -35,5 +35,5 @@ def report(run: Path, title: str, learning_starts: int) -> None:
     print(f"  {'before training' if steps[0] <= learning_starts else 'at first'} (step {steps[0]}): {mean[0]:.1f}")
     best = int(mean.argmax())
     print(f"  best (step {steps[best]}): {mean[best]:.1f}, kept as {run / 'best_model.zip'}")
-    print(f"  {'after' if steps[-1] > learning_starts else 'still before'} training (step {steps[-1]}): {mean[-1]:.1f}")
+    print(f"  {'last' if steps[-1] > learning_starts else 'still before training'} (step {steps[-1]}): {mean[-1]:.1f}")
     print(f"Learning curve: {run / 'learning_curve.png'}")

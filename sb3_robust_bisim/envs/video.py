@@ -70,7 +70,8 @@ def _find(files: ClipFiles) -> list[Path]:
         else:
             matches = [Path(match) for match in glob.glob(str(path), recursive=True) if Path(match).is_file()]
         if not matches:
-            raise ValueError(f"distractor_files names {str(entry)!r}, which is neither a file nor a folder or glob with files")
+            missing = f"distractor_files names {str(entry)!r}, which is neither a file nor a folder or glob with files"
+            raise ValueError(f"{missing}: correct the path")
         found.update(Path(os.path.abspath(match)) for match in matches)
     if not found:
         raise ValueError("distractor_files is empty: name a file, folder or glob, or omit it to use the default clips")

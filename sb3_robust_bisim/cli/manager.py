@@ -261,11 +261,12 @@ class BisimExperimentManager(ExperimentManager):
         elif self.options.checkpoint is not None:
             delete_checkpoint(self.options.checkpoint)  # the run is complete
         report(Path(self.save_path), title, -1 if self.continue_training else getattr(model, "learning_starts", -1))
-        if self.algo == ALGO and is_image_space(model.observation_space):
-            print(f"Video:          {record_or_explain(model, self._rendered_eval_env, Path(self.save_path))}")
         print(f"Model:          {self.save_path}/{self.env_name}.zip")
         if tensorboard_log := getattr(model, "tensorboard_log", None):  # a continued run logs where it began
             print(f"TensorBoard:    tensorboard --logdir {tensorboard_log}")
+        if self.algo == ALGO and is_image_space(model.observation_space):  # last, because an episode can take minutes
+            print("Video:          ", end="", flush=True)
+            print(record_or_explain(model, self._rendered_eval_env, Path(self.save_path)))
 
     def _rendered_eval_env(self) -> VecEnv:
         """An evaluation environment that renders RGB frames."""

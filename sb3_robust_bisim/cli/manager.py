@@ -265,8 +265,7 @@ class BisimExperimentManager(ExperimentManager):
         if tensorboard_log := getattr(model, "tensorboard_log", None):  # a continued run logs where it began
             print(f"TensorBoard:    tensorboard --logdir {tensorboard_log}")
         if self.algo == ALGO and is_image_space(model.observation_space):  # last, because an episode can take minutes
-            print("Video:          ", end="", flush=True)
-            print(record_or_explain(model, self._rendered_eval_env, Path(self.save_path)))
+            print(f"Video:          {record_or_explain(model, self._rendered_eval_env, Path(self.save_path))}")
 
     def _rendered_eval_env(self) -> VecEnv:
         """An evaluation environment that renders RGB frames."""

@@ -3,7 +3,7 @@
 import copyreg
 import warnings
 from functools import partial
-from typing import Any, SupportsIndex
+from typing import Any, SupportsIndex, TypeVar
 
 import numpy as np
 import torch as th
@@ -21,6 +21,7 @@ try:
 except ImportError:  # part of SB3's extras
     psutil = None
 
+Images = TypeVar("Images", np.ndarray, th.Tensor)
 BLANK = 0  # slot of the all-zero frame, which VecFrameStack uses to fill a stack after a reset
 ROWS = ("actions", "rewards", "dones", "timeouts", "_slots")  # arrays with one row per step of the environments
 
@@ -283,13 +284,13 @@ def frames_per_observation(venv: VecEnv) -> int:
     return 1 if stack is None else stack.stacked_obs.n_stack
 
 
-def newest_frames(stacks: np.ndarray, n_stack: int) -> np.ndarray:
+def newest_frames(stacks: Images, n_stack: int) -> Images:
     """
     :param stacks: (B, n_stack * C, H, W), in colour (C = 3) or grey
     :param n_stack: frames in a stack
     :return: (B, 3, H, W), the last frame of each
     """
-    return stacks[:, -3:] if stacks.shape[1] == 3 * n_stack else stacks[:, -1:].repeat(3, axis=1)
+    return stacks[:, [-3, -2, -1] if stacks.shape[1] == 3 * n_stack else [-1, -1, -1]]
 
 
 def choose_buffer(model: OffPolicyAlgorithm) -> None:

@@ -68,8 +68,8 @@ class EmbeddingCallback(DiagnosticCallback):
         """The newest frame of each stack, (B, 3, H, W) in [0, 1]; None if there are no images."""
         if isinstance(obs, dict) or not is_image_space(self.model.observation_space):
             return None
-        newest = newest_frames(obs.cpu().numpy(), frames_per_observation(self.training_env))
-        return (th.as_tensor(newest).float() / 255).clamp(0, 1)
+        newest = newest_frames(obs, frames_per_observation(self.training_env))
+        return (newest.float() / 255).clamp(0, 1)
 
 
 def _pca_figure(z: th.Tensor, values: th.Tensor) -> Figure:

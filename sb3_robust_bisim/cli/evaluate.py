@@ -75,7 +75,8 @@ def evaluate(args: argparse.Namespace) -> None:
     with closing(agent.make_env(next(iter(chosen.values())), args.seed)) as venv:
         model = agent.load(venv, args.device)
 
-    settings = {name: _settings(agent, env_kwargs, args) for name, env_kwargs in chosen.items()}
+    files = _hashes(agent)
+    settings = {name: _settings(files, agent.env_id, env_kwargs, args) for name, env_kwargs in chosen.items()}
     to_play = [name for name in chosen if settings[name] not in done]
     print(f"Agent: {agent.path}\nDistractors to play: {len(to_play)}. Already in {out / CSV}: {len(chosen) - len(to_play)}.")
     with tqdm(total=len(to_play) * args.n_episodes, unit="episode", disable=None) as bar:
@@ -152,11 +153,15 @@ def _video(model: BaseAlgorithm, agent: Agent, env_kwargs: dict[str, Any], score
     return f"Video: [{video}](<{video}>)."
 
 
-def _settings(agent: Agent, env_kwargs: dict[str, Any], args: argparse.Namespace) -> str:
+def _hashes(agent: Agent) -> list[str]:
+    """Of the agent's file and of VecNormalize's statistics, if there are any."""
+    files = (agent.path, Path(agent.stats or agent.path.parent, "vecnormalize.pkl"))
+    return [hashlib.sha256(file.read_bytes()).hexdigest() for file in files if file.is_file()]
+
+
+def _settings(files: list[str], env_id: str, env_kwargs: dict[str, Any], args: argparse.Namespace) -> str:
     """Fingerprint of what the numbers depend on, except for the content of the user's clips."""
-    files = [agent.path, Path(agent.stats or agent.path.parent, "vecnormalize.pkl")]
-    read = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files if file.is_file()]
-    everything = [*read, agent.env_id, env_kwargs, args.seed, args.n_episodes, args.n_states]
+    everything = [*files, env_id, env_kwargs, args.seed, args.n_episodes, args.n_states]
     return hashlib.sha256(_json(everything).encode()).hexdigest()[:16]
 
 

@@ -34,11 +34,11 @@ def import_suite(rendering: bool) -> None:
     chosen_here = False
     if sys.platform == "linux":
         wanted = os.environ.get("MUJOCO_GL", "").strip().lower()
-        if wanted != _chosen_before:
-            _check_backend(wanted, rendering)
         chosen_here = wanted in ("", _chosen_before)
         if chosen_here:
             os.environ["MUJOCO_GL"] = _chosen_before = _choose_backend(rendering)
+        else:
+            _check_backend(wanted, rendering)
     try:
         loaded = sys.modules.get("dm_control._render")
         if chosen_here and loaded is not None and loaded.BACKEND not in _LIBRARIES and not os.environ.get("DISPLAY"):

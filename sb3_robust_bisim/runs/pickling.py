@@ -86,11 +86,16 @@ def check_environments(env: VecEnv | gym.Env) -> None:
     except (NotSaveable, WorkerEnded):
         raise
     except Exception as error:  # pickling arbitrary objects can raise anything
-        raise NotSaveable(
-            f"{type(_culprit(env)).__name__} cannot be saved in the middle of an episode ({error}). Give it __getstate__() "
-            "and __setstate__(state), as pickle uses them, which return and restore everything that later steps depend on. "
-            "Otherwise, train without checkpoints."
-        ) from error
+        raise NotSaveable(_refusal(env, error)) from error
+
+
+def _refusal(env: VecEnv | gym.Env, error: Exception) -> str:
+    """What pickling raised, with the environment or wrapper that is to blame, and the remedy."""
+    return (
+        f"{type(_culprit(env)).__name__} cannot be saved in the middle of an episode ({error}). Give it __getstate__() "
+        "and __setstate__(state), as pickle uses them, which return and restore everything that later steps depend on. "
+        "Otherwise, train without checkpoints."
+    )
 
 
 def generator_states(device: th.device) -> tuple[Any, ...]:
@@ -182,12 +187,10 @@ class _Resumable(gym.Wrapper):
         """
         try:
             return dumps((self, generator_states(th.device("cpu"))))
-        except Exception as error:  # as in check_environments, which finds the culprit
-            try:
-                check_environments(self.env)
-            except NotSaveable as named:
-                return str(named)
-            return f"An environment cannot be saved in the middle of an episode ({error})."
+        except NotSaveable as error:
+            return str(error)
+        except Exception as error:  # as in check_environments
+            return _refusal(self.env, error)
 
 
 def _resumable(env_fn: Callable[[], gym.Env]) -> gym.Env:

@@ -9,7 +9,7 @@ observations. `floor` is the full method's matrix products and convolutions alon
 BisimSAC and the floor are timed with the actor every 2nd update (`paper`) and every update (`sac`), in fp32 and, where the CPU
 has the instructions, in bf16. All arms are interleaved in one process, one thread; peak memory is that of a process per arm.
 sbx needs the extra `bench`; without it the arm is left out. `families_over_full` compares other metrics with that of the full
-method. The last line printed is one JSON object.
+method, `keep_freed_memory` an update from pixels with and without this setting. The last line printed is one JSON object.
 """
 
 import argparse
@@ -42,6 +42,7 @@ from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer, IntrinsicRewardVe
 from sb3_robust_bisim.checks import has_bf16
 from sb3_robust_bisim.cli.zoo_config import DEFAULT_CONFIG, variant_settings
 from sb3_robust_bisim.encoders import MlpEncoder, PixelEncoder
+from sb3_robust_bisim.runs.allocator import keep_freed_memory
 
 BATCH = {"mlp": 512, "cnn": 128}
 SCHEDULE = {"paper": dict(policy_delay=2, target_update_interval=2), "sac": dict(policy_delay=1)}
@@ -52,7 +53,7 @@ CPU = dict(device="cpu", seed=0)  # as the floor
 OFF = dict(bisim_coef=0.0, norm_constraint=False)
 CARTPOLE = "robust_bisim/SparseCartPole-v0"
 PIXELS = "robust_bisim/cheetah-run-pixels-v0"
-PARTS = ("mlp", "cnn", "families_over_full", "bonus", "learn")
+PARTS = ("mlp", "cnn", "families_over_full", "bonus", "learn", "keep_freed_memory")
 
 
 class RandomPixels(gym.Env):
@@ -150,6 +151,33 @@ def peak_memory(kind: str, arm: str, schedule: str, bf16: bool) -> float:
     # not getrusage: its peak is the parent's where that one's was higher
     status = Path("/proc/self/status").read_text()
     return int(status.split("VmHWM:")[1].split()[0]) / 1024
+
+
+def update_time(arm: str, keep: bool) -> float:
+    """Milliseconds of an update from pixels in this process, whose allocator keeps freed memory if asked to."""
+    if keep and not keep_freed_memory():
+        raise SystemExit("the part `keep_freed_memory` needs glibc: leave it out of --parts")
+    model = build("cnn", arm, "paper", bf16=False)
+    times = []
+    for _ in range(12):
+        started = time.perf_counter()
+        model.train(1, BATCH["cnn"])
+        times.append(1000 * (time.perf_counter() - started))
+    return float(np.median(times[2:]))
+
+
+def kept_memory_cost(rounds: int) -> dict[str, dict[str, float]]:
+    """What `keep_freed_memory` saves, from processes that take turns: medians over the rounds."""
+    times: dict[str, tuple[list[float], list[float]]] = {arm: ([], []) for arm in ("full", "off", "sb3_encoder")}
+    with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
+        for _ in tqdm(range(rounds), desc="allocator", file=sys.stderr):
+            for arm, keep in itertools.product(times, (False, True)):
+                times[arm][keep].append(pool.apply(update_time, (arm, keep)))
+    result = {}
+    for arm, (default, kept) in times.items():
+        values = {"default_ms": default, "kept_ms": kept, "kept_over_default": np.divide(kept, default)}
+        result[arm] = {name: round(float(np.median(value)), 3) for name, value in values.items()}
+    return result
 
 
 Arm = tuple[str, str, bool]  # name, schedule, bf16
@@ -308,6 +336,7 @@ def main() -> None:
         "families_over_full": lambda: family_cost(args.rounds, per_round=4),
         "bonus": lambda: {CARTPOLE: bonus_cost(CARTPOLE, 1, 200), PIXELS: bonus_cost(PIXELS, 16, 10)},
         "learn": lambda: learn_cost(500),
+        "keep_freed_memory": lambda: kept_memory_cost(args.cnn_rounds // 2),
     }
     print(json.dumps({**result, **{part: measure[part]() for part in args.parts}}))
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from contextlib import nullcontext
+from functools import partial
 from typing import Any
 
 import torch as th
@@ -14,6 +15,8 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_robust_bisim.losses import project_to_ball
+
+LEAKY_RELU: Any = partial(nn.LeakyReLU, inplace=True)
 
 
 class Encoder(BaseFeaturesExtractor):
@@ -153,7 +156,7 @@ class PixelEncoder(BaseFeaturesExtractor):
                     f"strides={tuple(strides)} with images of shape {observation_space.shape}: strides must be at least 1, "
                     "and each convolution needs 3 pixels. Take fewer or smaller strides, or larger images."
                 )
-            convs += [nn.Conv2d(channels, 32, kernel_size=3, stride=stride), nn.ReLU()]
+            convs += [nn.Conv2d(channels, 32, kernel_size=3, stride=stride), nn.ReLU(inplace=True)]
             channels, size = 32, [(pixels - 3) // stride + 1 for pixels in size]
         self.convs = nn.Sequential(*convs, nn.Flatten())
         norm = nn.LayerNorm(features_dim) if layer_norm else nn.Identity()
@@ -191,5 +194,5 @@ class CombinedEncoder(BaseFeaturesExtractor):
 
 def _mlp(input_dim: int, width: int, n_layers: int, layer_norm: bool) -> list[nn.Module]:
     norm = [nn.LayerNorm] if layer_norm else []
-    layers = create_mlp(input_dim, -1, [width] * n_layers, nn.LeakyReLU, post_linear_modules=norm)  # type: ignore[arg-type]
+    layers = create_mlp(input_dim, -1, [width] * n_layers, LEAKY_RELU, post_linear_modules=norm)  # type: ignore[arg-type]
     return layers[:-1]  # the embedding itself is linear (or normalised)

@@ -31,6 +31,7 @@ from sb3_robust_bisim.cli.manager import ALGO, BisimExperimentManager, RunOption
 from sb3_robust_bisim.cli.record import check_video
 from sb3_robust_bisim.cli.settings import StoreSettings
 from sb3_robust_bisim.cli.zoo_config import DEFAULT_CONFIG, is_yaml
+from sb3_robust_bisim.runs.allocator import keep_freed_memory
 
 ALGOS[ALGO] = BisimSAC
 HYPERPARAMS_SAMPLER[ALGO] = sample_bisim_sac_params
@@ -72,6 +73,7 @@ def main(arguments: Sequence[str] | None = None, program: str = "robust-bisim") 
     if command == "train":
         ours, theirs = _train_arguments(program, options)
         manager = partial(BisimExperimentManager, ours)
+        keep_freed_memory()
         with (
             _replaced(sys, "argv", [program, *theirs]),
             _replaced(rl_zoo3.train, "ExperimentManager", manager),

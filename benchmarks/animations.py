@@ -125,7 +125,7 @@ def save_gif(path: Path, frames: list[Image.Image], fps: float, colors: int, hol
         sample.paste(frame, (0, i * frame.height))
     palette = sample.quantize(colors)
     first, *others = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    durations = [round(100 / fps) * 10] * len(frames)  # GIF counts hundredths of seconds
+    durations = (10 * np.diff(np.round(100 / fps * np.arange(len(frames) + 1)))).astype(int).tolist()  # hundredths of seconds
     durations[-1] += round(1000 * hold)
     with atomic_path(path) as temporary:
         first.save(temporary, save_all=True, append_images=others, duration=durations, loop=0, optimize=True)

@@ -441,7 +441,7 @@ def read_only_folders(folder: Path, args: argparse.Namespace) -> Measured:
 
 
 def two_processes(folder: Path, args: argparse.Namespace) -> Measured:
-    """Two processes on one checkpoint, one result and one video cache: one of them works or waits, and nothing mixes"""
+    """Two processes on one checkpoint, one result and one video cache: one works, one waits or is refused, nothing mixes"""
     alone, *_ = left_alone(folder)
     first = forked(folder / "log.txt", command_line, arguments(folder))
     wait_until((folder / "run.pkl").exists, "the first checkpoint", first)
@@ -655,7 +655,9 @@ def main() -> None:
     results = json.loads(args.out.read_text()) if args.out.exists() else {}
     commit = machine()["commit"]
     with tempfile.TemporaryDirectory() as work:
-        for name in args.only or [name for name in FAULTS if results.get(name, {}).get("commit") != commit]:
+        # a commit with later changes says nothing about those of now
+        tried = [name for name in results if results[name]["commit"] == commit and not commit.endswith("-dirty")]
+        for name in dict.fromkeys(args.only or [name for name in FAULTS if name not in tried]):
             results[name] = attempt(name, args, Path(work))
             results = {key: results[key] for key in FAULTS if key in results}
             with atomic_path(args.out) as file:

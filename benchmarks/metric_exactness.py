@@ -336,6 +336,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "metric_exactness")
     args = parser.parse_args()
     th.set_num_threads(1)
+    if args.out == parser.get_default("out") and args.only != parser.get_default("only"):
+        parser.error(f"--only: name another folder with --out, because {args.out} has the results of all arms.")
     wanted = [arm for arm in arms() if any(text in arm.name for text in args.only)]
     todo = [(arm, seed) for seed in args.seeds for arm in wanted]
     runs = []

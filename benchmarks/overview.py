@@ -44,6 +44,7 @@ METHODS = {  # in the figures: in the table
     "normed-ID": "normed-ID",
     "normed-IR": "normed-IR",
     "normed-IR-ID": "normed-IR-ID (full)",
+    "IR-ID": "full without ball",
     "normed-IR-no-metric": "normed-IR without metric",
     "normed-IR-ID-no-metric": "full without metric",
     "self-prediction": "self-prediction",

@@ -344,7 +344,10 @@ def setting(text: str) -> tuple[str, Any]:
     check_keys({key: value}, "--params")
     if not colon:
         raise ValueError(f"{text}: write KEY:VALUE")
-    return key, yaml.safe_load(value)
+    parsed = yaml.safe_load(value)
+    with contextlib.suppress(ValueError, TypeError):  # to YAML, 1e-3 is text
+        parsed = float(value) if isinstance(parsed, str) else parsed
+    return key, parsed
 
 
 def parse_arguments() -> argparse.Namespace:
@@ -398,6 +401,9 @@ def main() -> None:
         if run.panel_name in (args.panels or figure.panels) and run.method_name in (args.methods or figure.methods)
     ]
     results = {run: result_of(run, out) for run in runs}
+    every = runs_of(name, figure, max(MOST_SEEDS, args.seeds or 0))  # also what earlier sweeps have left
+    for run in every:  # a result of other settings, which cannot be drawn, is refused before anything runs
+        result_of(run, out)
     todo = [run for run, result in results.items() if result is None]
     done = [result for result in results.values() if result is not None]
     minutes = seconds_left(todo, done, figure) / 60
@@ -418,7 +424,6 @@ def main() -> None:
         check_writable("--out", out)
         check_writable("--work", args.work)
         failed = sweep(todo, args, out, sum(result["steps"] for result in done))
-    every = runs_of(name, figure, max(MOST_SEEDS, args.seeds or 0))  # also what earlier sweeps have left
     done = [result for run in every if (result := result_of(run, out)) is not None]
     if not done:
         sys.exit("No run has ended yet.")

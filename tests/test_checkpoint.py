@@ -367,6 +367,12 @@ def test_an_interval_that_is_no_number_of_steps_is_refused(every: Any) -> None:
         Checkpoint("checkpoint.pkl", every)
 
 
+def test_a_value_that_cannot_be_saved_is_named_before_training() -> None:
+    message = r"about\['settings'\]\['learning_rate'\]=<function .* cannot be saved in a checkpoint .*: use a plain value"
+    with pytest.raises(ValueError, match=message):
+        Checkpoint("checkpoint.pkl", 10, about={"settings": {"batch_size": 8, "learning_rate": lambda progress: progress}})
+
+
 @pytest.fixture
 def arguments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The arguments of a run that is cut off before it saves its agent. It leaves a checkpoint at step 50."""
@@ -415,6 +421,15 @@ def test_a_checkpoint_is_refused_if_the_config_evaluates_differently(command: li
 def test_a_resumed_run_may_be_longer(command: list[str], capsys: pytest.CaptureFixture) -> None:
     zoo.main([*command, "--seed", "3", "--n-timesteps", "80"])
     assert "Going on from step 50" in capsys.readouterr().out
+
+
+def test_a_moved_checkpoint_continues_in_its_new_file_and_with_the_interval_that_is_asked_for(
+    command: list[str], tmp_path: Path
+) -> None:
+    moved = (tmp_path / "checkpoint.pkl").rename(tmp_path / "moved.pkl")
+    zoo.main([*command, "--seed", "3", "--n-timesteps", "80", "--checkpoint", str(moved), "--checkpoint-freq", "20"])
+    assert read_about(moved)["num_timesteps"] == 70
+    assert not (tmp_path / "checkpoint.pkl").exists()
 
 
 def test_the_command_line_continues_another_versions_checkpoint_in_new_episodes(

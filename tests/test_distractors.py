@@ -217,7 +217,8 @@ def test_a_file_that_cannot_be_played_is_named_and_leaves_nothing_behind(tmp_pat
 def test_files_folders_and_globs_name_each_file_once(clips: Path) -> None:
     everything = [clips / f"{index}.mkv" for index in range(6)]
     for files in (clips, str(clips / "*.mkv"), str(clips.parent / "**" / "*.mkv"), [clips, clips / "1.mkv"], everything[::-1]):
-        assert split_clips({"train": files, "eval": files}) == {"train": everything, "eval": everything}
+        split = split_clips(files)
+        assert split["train"] + split["eval"] == everything
 
 
 def test_training_and_evaluation_clips_are_disjoint_and_complete(clips: Path) -> None:
@@ -227,6 +228,11 @@ def test_training_and_evaluation_clips_are_disjoint_and_complete(clips: Path) ->
     first, second = clips / "0.mkv", clips / "1.mkv"
     assert split_clips([first, second]) == {"train": [first], "eval": [second]}
     assert split_clips(first) == {"train": [first], "eval": []}
+
+
+def test_a_clip_for_both_training_and_evaluation_is_refused(clips: Path) -> None:
+    with pytest.raises(ValueError, match=r"distractor_files names .*1\.mkv for 'train' and for 'eval'.* name it once"):
+        split_clips({"train": [clips / "0.mkv", clips / "1.mkv"], "eval": str(clips / "[12].mkv")})
 
 
 def test_a_mapping_assigns_clips_to_training_and_evaluation(clips: Path) -> None:

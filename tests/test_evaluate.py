@@ -17,6 +17,7 @@ from rl_zoo3.utils import EnvironmentName
 from sb3_robust_bisim import BisimSAC
 from sb3_robust_bisim.cli.agents import latest_run
 from sb3_robust_bisim.cli.distractors import Noise, Scene, distractors_of
+from sb3_robust_bisim.cli.record import write_video
 from sb3_robust_bisim.cli.scores import Score
 from sb3_robust_bisim.cli.zoo import main
 from sb3_robust_bisim.cli.zoo_config import DEFAULT_CONFIG
@@ -84,7 +85,9 @@ def test_a_state_agent_plays_under_other_noise_in_its_own_task(
     logs: str, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     command = ["evaluate", "--env", CARTPOLE, "-f", logs, "--seed", "5", "--n-episodes", "3", "--n-states", "3", "--no-video"]
-    main([*command, "--out", str(tmp_path), "--distractors", "training", "std=0.5+mean=3"])
+    main([*command, "--out", str(tmp_path), "--distractors", "training", "std=0.5+mean=3", "std=1.0"])
+    assert "Distractors to play: 2." in (printed := capsys.readouterr().out)  # std=1.0 is that of the training
+    assert "| std=1.0 | yes |" in printed
     rows = rows_of(tmp_path)
     task = {"noise_multiplier": 1, "theta_rew_fraction": 0.5}
     for name, noise in {"training": {}, "std=0.5+mean=3": {"noise_std": 0.5, "noise_mean": 3.0}}.items():
@@ -143,6 +146,13 @@ def seconds_of_gif(path: Path) -> float:
             gif.seek(i)
             durations.append(gif.info["duration"])
     return sum(durations) / 1000
+
+
+@pytest.mark.parametrize("fps", [30, 40, 60])
+def test_a_gif_plays_as_long_as_the_episode_lasted(fps: int, tmp_path: Path) -> None:
+    frames = [np.full((8, 8, 3), i, dtype=np.uint8) for i in range(120)]
+    write_video(tmp_path / "agent.gif", frames, fps)
+    assert seconds_of_gif(tmp_path / "agent.gif") == pytest.approx(120 / fps)
 
 
 def test_enjoy_writes_a_video_of_one_episode_of_a_state_agent(

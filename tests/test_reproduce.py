@@ -183,6 +183,30 @@ def test_results_of_another_configuration_are_refused(tmp_path) -> None:
     assert not (tmp_path / "work").exists()
 
 
+def test_results_that_could_not_be_drawn_afterwards_are_refused_before_the_sweep(tmp_path) -> None:
+    recorded = json.loads((ROOT / "benchmarks/results/cartpole/N_m2_SAC_seed1.json").read_text())
+    recorded["arguments"]["batch_size"] = 64
+    path = tmp_path / "results" / "cartpole" / "N_m2_SAC_seed1.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps(recorded))
+    process = reproduce(tmp_path, "cartpole", "--seeds", "1", "--methods", "DBC")
+    assert process.returncode == 1
+    assert "N_m2_SAC_seed1.json was made with other settings" in process.stderr
+    assert not (tmp_path / "work").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("1e-3", 0.001), ("128", 128), ("auto_0.1", "auto_0.1"), ("l1", "l1"), ("null", None), ("[3, 2]", [3, 2])],
+)
+def test_settings_are_read_as_the_commands_read_them(text: str, value: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    from reproduce import setting
+
+    key, read = setting(f"learning_rate:{text}")
+    assert (key, read, type(read)) == ("learning_rate", value, type(value))
+
+
 def test_no_run_waits_for_another_seed_of_its_method(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
     from reproduce import train

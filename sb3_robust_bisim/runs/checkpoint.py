@@ -39,8 +39,8 @@ class Checkpoint(BaseCallback):
     :param every: environment steps between two checkpoints, summed over all environments, >= 1
     :param context: other objects to save in the same file. Objects that they share with the model stay shared
     :param about: plain values that :func:`read_about` returns without unpickling the rest
-    :raises ValueError: unless ``every`` is an integer >= 1; at the start of training, for environments that cannot be saved
-        (see :func:`save_checkpoint`)
+    :raises ValueError: unless ``every`` is an integer >= 1; for values of ``about`` that cannot be pickled; at the start of
+        training, for environments that cannot be saved (see :func:`save_checkpoint`)
     """
 
     def __init__(self, path: str | Path, every: int, context: Any = None, about: dict[str, Any] | None = None) -> None:
@@ -51,6 +51,7 @@ class Checkpoint(BaseCallback):
         self.every = every
         self.context = context
         self.about = about or {}
+        _check_plain(self.about)
         self._last = 0
 
     def _on_training_start(self) -> None:
@@ -179,6 +180,20 @@ def differences(there: Mapping[str, Any], here: Mapping[str, Any], place: str = 
     """
     keys = sorted(key for key in {*there, *here} if there.get(key) != here.get(key))
     return ", ".join(f"{key} is {there.get(key)} there and {here.get(key)} {place}" for key in keys)
+
+
+def _check_plain(values: Mapping[str, Any], place: str = "about") -> None:
+    """Name the value that pickle refuses, for example a function that a Python config file defines."""
+    for key, value in values.items():
+        try:
+            pickle.dumps(value)
+        except Exception as error:  # pickle has no class of its own for all of them
+            if isinstance(value, Mapping):
+                _check_plain(value, f"{place}[{key!r}]")
+            raise ValueError(
+                f"{place}[{key!r}]={value!r} cannot be saved in a checkpoint ({error}): use a plain value, or train without "
+                "checkpoints."
+            ) from error
 
 
 def _intact(path: Path) -> Path:

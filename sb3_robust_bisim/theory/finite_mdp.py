@@ -151,8 +151,10 @@ def wasserstein_distance(metric: Array, mu: ArrayLike, nu: ArrayLike, p: float =
     """
     check_order(p)
     first, second = (_distributions(name, row, np.shape(metric)[:1]) for name, row in (("mu", mu), ("nu", nu)))
-    sources, targets, mass = _optimal_coupling(metric**p, first, second)
-    return float(mass @ metric[sources, targets] ** p) ** (1 / p)
+    scale = metric.max() or 1.0  # the solver has an absolute tolerance, and powers overflow
+    cost = (metric / scale) ** p
+    sources, targets, mass = _optimal_coupling(cost, first, second)
+    return float(scale * (mass @ cost[sources, targets]) ** (1 / p))
 
 
 def mico_distance(mdp: FiniteMDP, policy: ArrayLike, c_r: float, c_t: float) -> Array:

@@ -345,7 +345,7 @@ def setting(text: str) -> tuple[str, Any]:
     if not colon:
         raise ValueError(f"{text}: write KEY:VALUE")
     parsed = yaml.safe_load(value)
-    with contextlib.suppress(ValueError, TypeError):  # to YAML, 1e-3 is text
+    with contextlib.suppress(ValueError):  # to YAML, 1e-3 is text
         parsed = float(value) if isinstance(parsed, str) else parsed
     return key, parsed
 

@@ -147,7 +147,9 @@ def _check_random_shift(pad: Any, space: spaces.Space) -> None:
     if not is_whole(pad, 0):
         raise ValueError(f"random_shift={pad!r}: it must be an integer in [0, image size), 0 for none.")
     if pad > 0 and not is_image_space(space):
-        raise ValueError(f"random_shift={pad} with observations {space}: it needs images of bytes. Set random_shift=0.")
+        raise ValueError(
+            f"random_shift={pad} with observations of shape {space.shape}: it needs images of bytes. Set random_shift=0."
+        )
     if pad > 0 and pad >= (size := sorted(space.shape or ())[1]):  # the smallest axis is the channels
         raise ValueError(f"random_shift={pad}: it must be an integer in [0, {size - 1}] for images {space.shape}.")
 

@@ -220,7 +220,7 @@ def test_a_value_that_algorithm_or_task_refuses_leaves_no_run(
 ) -> None:
     with pytest.raises(UsageError, match=message):
         zoo("train", "--env", CARTPOLE, *arguments, "-f", str(tmp_path / "logs"))
-    assert not list((tmp_path / "logs" / "bisim_sac").iterdir())
+    assert not (tmp_path / "logs").exists()
 
 
 class Broken(gym.Env):
@@ -458,12 +458,22 @@ def test_a_checkpoint_that_another_process_writes_is_refused(zoo: Zoo, tmp_path:
     assert "Model:          " in zoo(*arguments)
 
 
-@pytest.mark.parametrize("number", ["0", "-1"])
-def test_a_run_without_steps_is_refused(zoo: Zoo, number: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("-n", "0", "--n-timesteps 0: must be at least 1."),
+        ("-n", "-1", "--n-timesteps -1: must be at least 1."),
+        ("--eval-episodes", "0", "--eval-episodes 0: must be at least 1."),
+        ("--n-eval-envs", "0", "--n-eval-envs 0: must be at least 1."),
+        ("--n-trials", "0", "--n-trials 0: must be at least 1."),
+        ("-i", "nothere.zip", "-i nothere.zip: there is no such file. Pass the .zip of a saved agent."),
+    ],
+)
+def test_a_run_that_could_not_work_is_refused(zoo: Zoo, option: str, value: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as stop:
-        zoo("train", "--env", CARTPOLE, "-n", number, "-f", str(tmp_path / "logs"))
+        zoo("train", "--env", CARTPOLE, option, value, "-f", str(tmp_path / "logs"))
     assert stop.value.code == 2
-    assert f"--n-timesteps {number}: must be at least 1." in zoo.output
+    assert message in zoo.output
     assert not (tmp_path / "logs").exists()
 
 

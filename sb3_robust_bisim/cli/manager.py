@@ -3,6 +3,7 @@
 import inspect
 import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
@@ -92,6 +93,7 @@ class BisimExperimentManager(ExperimentManager):
         self.variants = list(options.variants)
         self.resumed = False
         self.made_folder: Path | None = None
+        self.new_parents: list[Path] = []
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         params = self.custom_hyperparams or {}
@@ -159,6 +161,9 @@ class BisimExperimentManager(ExperimentManager):
         except BaseException:  # no run has begun, so it leaves no folder
             if self.made_folder is not None:
                 shutil.rmtree(self.made_folder, ignore_errors=True)
+            for folder in self.new_parents:
+                with suppress(OSError):  # another run has begun in it
+                    folder.rmdir()
             raise
 
     def _set_up(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
@@ -176,7 +181,9 @@ class BisimExperimentManager(ExperimentManager):
         """Take the next free number: rl-zoo3 chose one before it made the folder, and another run may have begun since."""
         stem, number = self.save_path.rsplit("_", 1)
         if number.isdigit():  # not with -uuid
-            Path(self.log_path).mkdir(parents=True, exist_ok=True)
+            folder = Path(self.log_path)
+            self.new_parents = [parent for parent in (folder, *folder.parents) if not parent.exists()]
+            folder.mkdir(parents=True, exist_ok=True)
             for free in count(int(number)):
                 try:
                     Path(f"{stem}_{free}").mkdir()

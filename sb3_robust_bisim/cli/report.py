@@ -17,7 +17,7 @@ def report(run: Path, title: str, learning_starts: int) -> None:
     :param learning_starts: step of the first update; -1 if the agent was trained before the run
     """
     if not (run / "evaluations.npz").exists():
-        print("No learning curve without evaluations: --eval-freq is larger than the number of steps, or negative.")
+        print("No learning curve without evaluations: --eval-freq is larger than the number of steps, or below 1.")
         return
     with np.load(run / "evaluations.npz") as evaluations:
         steps, returns = evaluations["timesteps"], evaluations["results"]

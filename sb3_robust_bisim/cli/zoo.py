@@ -209,6 +209,7 @@ def _train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, li
         parser.error(f"--checkpoint-freq {ours.checkpoint_freq}: must be at least 1.")
     if ours.n_timesteps is not None and ours.n_timesteps < 1:  # rl-zoo3 would take the config file's
         parser.error(f"--n-timesteps {ours.n_timesteps}: must be at least 1. Without it, the config file's number counts.")
+    _check_numbers(parser, theirs)
     if ours.new_episodes and ours.checkpoint is None:
         parser.error("--new-episodes: needs --checkpoint FILE.")
     if ours.checkpoint is not None:
@@ -224,6 +225,20 @@ def _train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, li
     seed_given = ours.seed is not None and ours.seed >= 0
     options = RunOptions(tuple(ours.variants), ours.checkpoint, ours.checkpoint_freq, ours.new_episodes, seed_given)
     return options, theirs
+
+
+def _check_numbers(parser: argparse.ArgumentParser, arguments: list[str]) -> None:
+    """Refuse numbers and files of rl-zoo3's options with which it would fail after the start, or print nonsense."""
+    theirs = argparse.ArgumentParser(prog=parser.prog, add_help=False, allow_abbrev=False, usage=argparse.SUPPRESS)
+    for option in ("--eval-episodes", "--n-eval-envs", "--n-trials"):
+        theirs.add_argument(option, type=int, default=1)
+    theirs.add_argument("-i", "--trained-agent", type=Path)
+    given, _ = theirs.parse_known_args(arguments)
+    for option in ("eval_episodes", "n_eval_envs", "n_trials"):
+        if (value := getattr(given, option)) < 1:
+            parser.error(f"--{option.replace('_', '-')} {value}: must be at least 1.")
+    if given.trained_agent is not None and not given.trained_agent.is_file():
+        parser.error(f"-i {given.trained_agent}: there is no such file. Pass the .zip of a saved agent.")
 
 
 def _enjoy(program: str, arguments: list[str]) -> None:

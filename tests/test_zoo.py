@@ -467,6 +467,8 @@ def test_a_checkpoint_that_another_process_writes_is_refused(zoo: Zoo, tmp_path:
         ("--n-eval-envs", "0", "--n-eval-envs 0: must be at least 1."),
         ("--n-trials", "0", "--n-trials 0: must be at least 1."),
         ("-i", "nothere.zip", "-i nothere.zip: there is no such file. Pass the .zip of a saved agent."),
+        ("--trial-id", "3", "--trial-id 3: needs --storage and --study-name."),
+        ("--device", "gpu", "--device gpu: torch knows no such device. Use cpu, cuda or auto."),
     ],
 )
 def test_a_run_that_could_not_work_is_refused(zoo: Zoo, option: str, value: str, message: str, tmp_path: Path) -> None:

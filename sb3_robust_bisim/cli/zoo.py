@@ -20,6 +20,7 @@ from filelock import FileLock, Timeout
 from rl_zoo3 import ALGOS
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, convert_offpolicy_params
 from rl_zoo3.utils import EnvironmentName
+from stable_baselines3.common.utils import get_device
 
 from sb3_robust_bisim.bisim_sac import BisimSAC
 from sb3_robust_bisim.checks import closest
@@ -209,7 +210,7 @@ def _train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, li
         parser.error(f"--checkpoint-freq {ours.checkpoint_freq}: must be at least 1.")
     if ours.n_timesteps is not None and ours.n_timesteps < 1:  # rl-zoo3 would take the config file's
         parser.error(f"--n-timesteps {ours.n_timesteps}: must be at least 1. Without it, the config file's number counts.")
-    _check_numbers(parser, theirs)
+    _check_theirs(parser, theirs)
     if ours.new_episodes and ours.checkpoint is None:
         parser.error("--new-episodes: needs --checkpoint FILE.")
     if ours.checkpoint is not None:
@@ -227,18 +228,27 @@ def _train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, li
     return options, theirs
 
 
-def _check_numbers(parser: argparse.ArgumentParser, arguments: list[str]) -> None:
-    """Refuse numbers and files of rl-zoo3's options with which it would fail after the start, or print nonsense."""
+def _check_theirs(parser: argparse.ArgumentParser, arguments: list[str]) -> None:
+    """Refuse values of rl-zoo3's options that it ignores, or with which it fails after the start."""
     theirs = argparse.ArgumentParser(prog=parser.prog, add_help=False, allow_abbrev=False, usage=argparse.SUPPRESS)
     for option in ("--eval-episodes", "--n-eval-envs", "--n-trials"):
         theirs.add_argument(option, type=int, default=1)
     theirs.add_argument("-i", "--trained-agent", type=Path)
+    theirs.add_argument("--device", default="auto")
+    for option in ("--trial-id", "--storage", "--study-name"):
+        theirs.add_argument(option)
     given, _ = theirs.parse_known_args(arguments)
     for option in ("eval_episodes", "n_eval_envs", "n_trials"):
         if (value := getattr(given, option)) < 1:
             parser.error(f"--{option.replace('_', '-')} {value}: must be at least 1.")
     if given.trained_agent is not None and not given.trained_agent.is_file():
         parser.error(f"-i {given.trained_agent}: there is no such file. Pass the .zip of a saved agent.")
+    if given.trial_id is not None and not (given.storage and given.study_name):
+        parser.error(f"--trial-id {given.trial_id}: needs --storage and --study-name.")
+    try:
+        get_device(given.device)
+    except RuntimeError:
+        parser.error(f"--device {given.device}: torch knows no such device. Use cpu, cuda or auto.")
 
 
 def _enjoy(program: str, arguments: list[str]) -> None:

@@ -336,8 +336,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "metric_exactness")
     args = parser.parse_args()
     th.set_num_threads(1)
-    if args.out == parser.get_default("out") and args.only != parser.get_default("only"):
-        parser.error(f"--only: name another folder with --out, because {args.out} has the results of all arms.")
+    if args.out == parser.get_default("out"):
+        for option in ("seeds", "steps", "only"):
+            if getattr(args, option) != parser.get_default(option):
+                parser.error(f"--{option}: name another folder with --out, because {args.out} has the published results.")
     wanted = [arm for arm in arms() if any(text in arm.name for text in args.only)]
     todo = [(arm, seed) for seed in args.seeds for arm in wanted]
     runs = []

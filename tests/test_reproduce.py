@@ -199,7 +199,7 @@ def test_results_that_could_not_be_drawn_afterwards_are_refused_before_the_sweep
     ("text", "value"),
     [("1e-3", 0.001), ("128", 128), ("auto_0.1", "auto_0.1"), ("l1", "l1"), ("null", None), ("[3, 2]", [3, 2])],
 )
-def test_settings_are_read_as_the_commands_read_them(text: str, value: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_setting_is_read_as_yaml_and_1e_3_as_a_number(text: str, value: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
     from reproduce import setting
 

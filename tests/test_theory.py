@@ -86,6 +86,15 @@ class TestTransport:
         expected = wasserstein_distance(distance, mu, nu, p)
         assert wasserstein_distance(scale * distance, mu, nu, p) == pytest.approx(scale * expected, rel=1e-6)
 
+    @pytest.mark.parametrize("p", [1.0, 2.0, 4.0, 100.0])
+    def test_does_not_depend_on_a_far_state_without_mass(self, p: float) -> None:
+        random = np.random.default_rng(0)
+        position = np.append(random.random(12), 1e6)
+        distance = np.abs(np.subtract.outer(position, position))
+        mu, nu = random.dirichlet(np.ones(12), size=2)
+        expected = wasserstein_distance(distance[:12, :12], mu, nu, p)
+        assert wasserstein_distance(distance, np.append(mu, 0), np.append(nu, 0), p) == pytest.approx(expected, rel=1e-9)
+
     def test_between_point_masses_is_the_distance(self) -> None:
         assert wasserstein_distance(np.array([[0.0, 7.0], [7.0, 0.0]]), [1, 0], [0, 1], p=3) == pytest.approx(7.0)
 

@@ -275,7 +275,7 @@ class BisimExperimentManager(ExperimentManager):
         if self.algo == ALGO and is_image_space(model.observation_space):  # an episode can take minutes
             print(f"Video:          {record_or_explain(model, self._rendered_eval_env, Path(self.save_path))}")
         if self.options.checkpoint is not None and model.num_timesteps >= self.n_timesteps:
-            delete_checkpoint(self.options.checkpoint)  # last: until here, the same command can repeat what failed
+            delete_checkpoint(self.options.checkpoint)  # last: if the report fails, the run can go on
 
     def _rendered_eval_env(self) -> VecEnv:
         """An evaluation environment that renders RGB frames."""

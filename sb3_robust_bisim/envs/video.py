@@ -50,7 +50,7 @@ def split_clips(files: SplitClipFiles | None) -> dict[str, list[Path]]:
         if both := sorted(set(split_files["train"]) & set(split_files["eval"])):
             raise ValueError(
                 f"distractor_files names {', '.join(map(str, both))} for 'train' and for 'eval', but clips for 'eval' are "
-                "held out: name it once, or evaluate with split='train'"
+                "held out: name it for one of them. To evaluate on training clips, pass split='train' as well"
             )
         return split_files
     clips = _default_clips() if files is None else _find(files)

@@ -151,8 +151,10 @@ def wasserstein_distance(metric: Array, mu: ArrayLike, nu: ArrayLike, p: float =
     """
     check_order(p)
     first, second = (_distributions(name, row, np.shape(metric)[:1]) for name, row in (("mu", mu), ("nu", nu)))
-    scale = metric.max() or 1.0  # the solver has an absolute tolerance, and powers overflow
-    cost = (metric / scale) ** p
+    # the solver has an absolute tolerance, and powers overflow; a state without mass does not count
+    scale = metric[np.ix_(first > 0, second > 0)].max() or 1.0
+    with np.errstate(over="ignore"):
+        cost = (metric / scale) ** p
     sources, targets, mass = _optimal_coupling(cost, first, second)
     return float(scale * (mass @ cost[sources, targets]) ** (1 / p))
 

@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageOps, ImageSequence
 
 import sb3_robust_bisim
+from sb3_robust_bisim.cli.record import gif_durations
 from sb3_robust_bisim.runs.atomic import atomic_path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -125,7 +126,7 @@ def save_gif(path: Path, frames: list[Image.Image], fps: float, colors: int, hol
         sample.paste(frame, (0, i * frame.height))
     palette = sample.quantize(colors)
     first, *others = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    durations = (10 * np.diff(np.round(100 / fps * np.arange(len(frames) + 1)))).astype(int).tolist()  # hundredths of seconds
+    durations = gif_durations(len(frames), fps)
     durations[-1] += round(1000 * hold)
     with atomic_path(path) as temporary:
         first.save(temporary, save_all=True, append_images=others, duration=durations, loop=0, optimize=True)

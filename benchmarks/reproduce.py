@@ -395,17 +395,12 @@ def main() -> None:
     args = parse_arguments()
     name, figure = adjusted(args.figure, args)
     out = args.out or (ROOT / "results" if figure == FIGURES[args.figure] else args.work / "results")
-    runs = [
-        run
-        for run in runs_of(name, figure, args.seeds or figure.seeds)
-        if run.panel_name in (args.panels or figure.panels) and run.method_name in (args.methods or figure.methods)
-    ]
-    results = {run: result_of(run, out) for run in runs}
-    every = runs_of(name, figure, max(MOST_SEEDS, args.seeds or 0))  # also what earlier sweeps have left
-    for run in every:  # a result of other settings, which cannot be drawn, is refused before anything runs
-        result_of(run, out)
-    todo = [run for run, result in results.items() if result is None]
-    done = [result for result in results.values() if result is not None]
+    seeds, panels, methods = args.seeds or figure.seeds, args.panels or figure.panels, args.methods or figure.methods
+    every = runs_of(name, figure, max(MOST_SEEDS, seeds))  # also what earlier sweeps have left and what is drawn with it
+    results = {run: result_of(run, out) for run in every}  # which refuses results of other settings before anything runs
+    runs = [run for run in every if run.seed < seeds and run.panel_name in panels and run.method_name in methods]
+    todo = [run for run in runs if results[run] is None]
+    done = [result for run in runs if (result := results[run]) is not None]
     minutes = seconds_left(todo, done, figure) / 60
     rest = f"{minutes:.0f} minutes" if minutes < 90 else f"{minutes / 60:.1f} hours"
     left = (

@@ -126,12 +126,18 @@ def write_video(path: Path, frames: list[np.ndarray], fps: float) -> None:
         if path.suffix == ".gif":
             every = math.ceil(fps / GIF_FPS)
             first, *others = [Image.fromarray(frame) for frame in frames[::every]]
-            # GIF counts hundredths of seconds, so the times are rounded and not the durations: rounding does not add up
-            times = np.round(100 * every / fps * np.arange(len(others) + 2))
-            durations = (10 * np.diff(times)).astype(int).tolist()
+            durations = gif_durations(len(others) + 1, fps / every)
             first.save(temporary, save_all=True, append_images=others, duration=durations, loop=0)
         else:
             _imageio().mimwrite(temporary, frames, format="FFMPEG", fps=fps, macro_block_size=2)
+
+
+def gif_durations(n_frames: int, fps: float) -> list[int]:
+    """
+    Milliseconds for which a GIF shows each frame. GIF counts hundredths of seconds: the times are rounded and not the
+    durations, so that the error does not add up.
+    """
+    return (10 * np.diff(np.round(100 / fps * np.arange(n_frames + 1)))).astype(int).tolist()
 
 
 def _imageio() -> Any:

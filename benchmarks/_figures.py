@@ -14,6 +14,7 @@ CARTPOLE = "robust_bisim/SparseCartPole-v0"
 MOUNTAIN_CAR = "robust_bisim/MountainCarContinuous-v0"
 PENDULUM = "robust_bisim/SparsePendulum-v0"
 SWINGUP_PIXELS = "robust_bisim/cartpole-swingup-pixels-v0"
+BALL_IN_CUP_PIXELS = "robust_bisim/ball_in_cup-catch-pixels-v0"
 # the literature's hard noise: all dimensions are mixed
 PROJECTED = {"action_repeat": 4, "noise_multiplier": 2, "random_projection": True}
 ALL_ROWS = ("mean_return", "iqm_return", "embedding_norm_max")  # an interquartile mean takes more than three seeds
@@ -203,7 +204,8 @@ FIGURES = {
         {
             "video": _SWINGUP_VIDEO,
             "clean": Panel(SWINGUP_PIXELS, variants=("clean", "small")),
-            "ball_in_cup": Panel("robust_bisim/ball_in_cup-catch-pixels-v0", variants=("small",), splits=("train", "eval")),
+            "ball_in_cup": Panel(BALL_IN_CUP_PIXELS, variants=("small",), splits=("train", "eval")),
+            "ball_in_cup_clean": Panel(BALL_IN_CUP_PIXELS, variants=("clean", "small")),
         },
         {
             "normed-IR-ID": Method(("normed-IR-ID",), _BALANCED),
@@ -226,6 +228,7 @@ FIGURES = {
             "SAC": Method(("SAC",), {"random_shift": 0}, panels=("video",)),
         },
         *(2, 80_000, 4000, 5, 50),
+        eval_envs=5,
     ),
     # a million frames, where published agents are compared, and twice the updates
     "dmc_pixels_long": Figure(
@@ -235,6 +238,7 @@ FIGURES = {
             "SAC-shift": Method(("SAC",), _LONG),
         },
         *(2, 125_000, 5000, 5, 45),
+        eval_envs=5,
     ),
     "bf16": Figure(
         _noisy(CARTPOLE, 2),

@@ -86,7 +86,7 @@ class Run:
         settings = configured(self.panel.env_id, *self.method.variants, *self.panel.variants)
         return json.loads(json.dumps(without_identity({**settings, **self.method.params})))
 
-    def command(self, folder: Path, device: str) -> list[str]:
+    def command(self, folder: Path, device: str, vec_env: str) -> list[str]:
         """What follows ``python -m sb3_robust_bisim``."""
         return [
             *("train", "--env", self.panel.env_id, "--variant", *self.method.variants, *self.panel.variants),
@@ -94,7 +94,7 @@ class Run:
             *("--eval-freq", str(self.eval_freq), "--eval-episodes", str(self.eval_episodes)),
             *("--n-eval-envs", str(self.eval_envs)),
             *("--log-interval", "1", "--verbose", "0", "--num-threads", "1", "--log-folder", str(folder)),
-            *("--tensorboard-log", str(folder / "tensorboard"), "--device", device),
+            *("--tensorboard-log", str(folder / "tensorboard"), "--device", device, "--vec-env", vec_env),
             *("--checkpoint", str(folder / "checkpoint.pkl"), "--checkpoint-freq", str(self.eval_freq)),
             *_store_dict("--env-kwargs", self.panel.env_kwargs),
             *_store_dict("-params", self.method.params),
@@ -311,7 +311,7 @@ def sweep(todo: list[Run], args: argparse.Namespace, out: Path, done: int) -> li
     work, out = args.work.resolve(), out.resolve()
     tasks = [
         joblib.delayed(train)(
-            run.command(work / run.figure / run.name, args.device),
+            run.command(work / run.figure / run.name, args.device, args.vec_env),
             *(work / run.figure / run.name, out / run.figure / f"{run.name}.json"),
             *(run.identity, commit, run.panel.splits),
         )
@@ -361,6 +361,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--methods", nargs="+", help="some of the methods (default: all)")
     parser.add_argument("--jobs", type=int, default=joblib.cpu_count(), help="local processes (default: %(default)s)")
     parser.add_argument("--device", default="cpu", help="of every run; on one GPU --jobs 1 or a few (default: %(default)s)")
+    parser.add_argument("--vec-env", choices=("dummy", "subproc"), default="dummy", help="subproc: each environment in a process")
     parser.add_argument("--backend", choices=("loky", "dask"), default="loky", help="local processes, or a Dask cluster")
     parser.add_argument("--scheduler", help="address of the Dask scheduler, host:port; its workers need --nthreads 1")
     parser.add_argument(
@@ -411,7 +412,7 @@ def main() -> None:
     print(f"{len(done)} of {len(runs)} runs have ended; {left}.", file=sys.stderr)
     if args.dry_run:
         for run in todo:
-            command = run.command(args.work / run.figure / run.name, args.device)
+            command = run.command(args.work / run.figure / run.name, args.device, args.vec_env)
             print(shlex.join(["python", "-m", "sb3_robust_bisim", *command]).replace(f"{Path.cwd()}/", ""))
         return
     failed = []

@@ -31,6 +31,7 @@ import torch as th
 from _aggregate import FULL as FULL_METHOD
 from _figures import FIGURES, Method
 from _machine import machine
+from _random_pixels import RandomPixels
 from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
@@ -54,21 +55,6 @@ OFF = dict(bisim_coef=0.0, norm_constraint=False)
 CARTPOLE = "robust_bisim/SparseCartPole-v0"
 PIXELS = "robust_bisim/cheetah-run-pixels-v0"
 PARTS = ("mlp", "cnn", "families_over_full", "bonus", "learn", "keep_freed_memory")
-
-
-class RandomPixels(gym.Env):
-    """Three stacked RGB frames of noise: what an update costs does not depend on what is to be seen."""
-
-    observation_space = gym.spaces.Box(0, 255, (9, 84, 84), np.uint8)
-    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
-
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
-        super().reset(seed=seed)
-        return self.np_random.integers(0, 256, (9, 84, 84), dtype=np.uint8), {}
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        obs, _ = self.reset()
-        return obs, 0.5, False, False, {}
 
 
 def build(kind: str, arm: str, schedule: str, bf16: bool) -> BaseAlgorithm:

@@ -194,14 +194,23 @@ def begin(folder: Path, measured: dict) -> dict:
     """Clear away what cannot be gone on with, and say which code and machine the run is made with."""
     path = folder / "measured.json"
     if (folder / "checkpoint.pkl").exists() or (folder / "trained.json").exists():
-        begun = json.loads(path.read_text()) if path.exists() else {}
-        for key in ("commit", "machine"):
-            if not (before := begun.get(key, "unknown")).endswith(measured[key]):
-                measured = {**measured, key: f"{before}, then {measured[key]}"}
+        measured = both(json.loads(path.read_text()) if path.exists() else {}, measured)
     else:
         shutil.rmtree(folder)
     write(path, json.dumps(measured))
     return measured
+
+
+def both(before: dict, now: dict) -> dict:
+    """What differs between two measurements of a run is in the result twice."""
+    said = {}
+    for key, value in now.items():
+        earlier = before.get(key, {} if isinstance(value, dict) else "unknown")
+        if isinstance(value, dict):
+            said[key] = both(earlier, value)
+        else:
+            said[key] = value if earlier.endswith(value) else f"{earlier}, then {value}"
+    return said
 
 
 def learn(command: list[str], folder: Path, before_last: int) -> dict[str, str]:

@@ -16,7 +16,7 @@ def random_shift(images: th.Tensor, pad: int) -> th.Tensor:
         The offsets are drawn with the generator of the CPU
     """
     offsets = th.randint(2 * pad + 1, (len(images), 2)) - pad
-    return _by_index(images, offsets) if images.is_cuda else _by_copy(images, offsets)
+    return _by_copy(images, offsets) if images.device.type == "cpu" else _by_index(images, offsets)
 
 
 def _by_copy(images: th.Tensor, offsets: th.Tensor) -> th.Tensor:

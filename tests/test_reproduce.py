@@ -207,6 +207,20 @@ def test_a_setting_is_read_as_yaml_and_1e_3_as_a_number(text: str, value: Any, m
     assert (key, read, type(read)) == ("learning_rate", value, type(value))
 
 
+def test_a_run_that_moves_names_both_machines_and_their_versions(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    from reproduce import begin
+
+    gpu = {"commit": "a", "machine": "GPU", "versions": {"torch": "2.11", "numpy": "2.4"}}
+    cpu = {**gpu, "machine": "CPU", "versions": {"torch": "2.13", "numpy": "2.4"}}
+    (tmp_path / "run").mkdir()
+    assert begin(tmp_path / "run", gpu) == gpu
+    (tmp_path / "run" / "trained.json").touch()
+    moved = {"commit": "a", "machine": "GPU, then CPU", "versions": {"torch": "2.11, then 2.13", "numpy": "2.4"}}
+    for _ in range(2):  # the second time it has not moved
+        assert begin(tmp_path / "run", cpu) == moved
+
+
 def test_no_run_waits_for_another_seed_of_its_method(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
     from reproduce import train

@@ -209,7 +209,7 @@ def both(before: dict, now: dict) -> dict:
         if isinstance(value, dict):
             said[key] = both(earlier, value)
         else:
-            said[key] = value if earlier.endswith(value) else f"{earlier}, then {value}"
+            said[key] = earlier if earlier.split(", then ")[-1] == value else f"{earlier}, then {value}"
     return said
 
 

@@ -155,7 +155,7 @@ class BisimSAC(Interruptible, SAC):
         self._update_learning_rate(optimizers)
 
         representation, actor_parameters = self.policy.representation, self.policy.actor_parameters()
-        online, targets = (list(net.parameters()) for net in (self.critic, self.critic_target))
+        online, targets = ([param.detach() for param in net.parameters()] for net in (self.critic, self.critic_target))
         inverse_dynamics_optimizer = representation.inverse_dynamics.optimizer
         log = UpdateLog()
         if self._n_updates == 0:
@@ -242,9 +242,9 @@ class BisimSAC(Interruptible, SAC):
 
             # Update target networks. SAC tests the loop index, which is always 0 at `gradient_steps=1`
             if self._n_updates % self.target_update_interval == 0:
-                with th.no_grad():  # SB3's polyak_update, which starts two operations for each parameter
-                    th._foreach_mul_(targets, 1 - self.tau)
-                    th._foreach_add_(targets, online, alpha=self.tau)
+                # As polyak_update, which starts two operations for each parameter
+                th._foreach_mul_(targets, 1 - self.tau)
+                th._foreach_add_(targets, online, alpha=self.tau)
                 # Copy running stats, see GH issue #996
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 

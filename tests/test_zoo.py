@@ -25,7 +25,8 @@ from sb3_robust_bisim.cli.errors import UsageError, refusals
 from sb3_robust_bisim.cli.manager import BisimExperimentManager, sample_bisim_sac_params
 from sb3_robust_bisim.cli.report import report
 from sb3_robust_bisim.cli.settings import StoreSettings
-from sb3_robust_bisim.cli.zoo import COMMANDS, SET_BY_THE_USER, main, shell
+from sb3_robust_bisim.cli.options import SET_BY_THE_USER
+from sb3_robust_bisim.cli.zoo import COMMANDS, main, shell
 from sb3_robust_bisim.cli.zoo_config import check_keys, variant_settings
 
 ROOT = Path(__file__).parent.parent
@@ -468,12 +469,17 @@ def test_a_checkpoint_that_another_process_writes_is_refused(zoo: Zoo, tmp_path:
         ("--n-trials", "0", "--n-trials 0: must be at least 1."),
         ("-i", "nothere.zip", "-i nothere.zip: there is no such file. Pass the .zip of a saved agent."),
         ("--trial-id", "3", "--trial-id 3: needs --storage and --study-name."),
-        ("--device", "gpu", "--device gpu: torch knows no such device. Use cpu, cuda or auto."),
+        ("--device", "gpu", "--device gpu: not here (Expected one of cpu, cuda"),
+        ("--device", "cuda", "--device cuda: not here (Torch not compiled with CUDA"),
+        ("--checkpoint-freq", "500", "--checkpoint-freq: needs --checkpoint FILE."),
+        ("--num-threads", "0", "argument --num-threads: 0 must be at least 1, or -1"),
+        ("--tensorboard-log", "/dev/null/tb", "--tensorboard-log /dev/null/tb: /dev/null Not a directory; name a folder"),
+        ("--log-folder", "/dev/null/logs", "--log-folder /dev/null/logs: /dev/null Not a directory; name a folder"),
     ],
 )
 def test_a_run_that_could_not_work_is_refused(zoo: Zoo, option: str, value: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as stop:
-        zoo("train", "--env", CARTPOLE, option, value, "-f", str(tmp_path / "logs"))
+        zoo("train", "--env", CARTPOLE, "-f", str(tmp_path / "logs"), option, value)
     assert stop.value.code == 2
     assert message in zoo.output
     assert not (tmp_path / "logs").exists()

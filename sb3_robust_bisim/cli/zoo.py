@@ -4,7 +4,6 @@ import argparse
 import os
 import signal
 import sys
-import tempfile
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -12,15 +11,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import rl_zoo3.enjoy
 import rl_zoo3.train
-import torch as th
 from filelock import FileLock, Timeout
 from rl_zoo3 import ALGOS
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, convert_offpolicy_params
 from rl_zoo3.utils import EnvironmentName
-from stable_baselines3.common.utils import get_device
 
 from sb3_robust_bisim.bisim_sac import BisimSAC
 from sb3_robust_bisim.checks import closest
@@ -28,10 +24,11 @@ from sb3_robust_bisim.cli.agents import add_agent_arguments, find_file
 from sb3_robust_bisim.cli.enjoy import record_episode, trained_run, trained_tasks
 from sb3_robust_bisim.cli.errors import UsageError, refusals
 from sb3_robust_bisim.cli.evaluate import DESCRIPTION, add_arguments, check_arguments, evaluate
-from sb3_robust_bisim.cli.manager import ALGO, BisimExperimentManager, RunOptions, sample_bisim_sac_params
+from sb3_robust_bisim.cli.manager import ALGO, BisimExperimentManager, sample_bisim_sac_params
+from sb3_robust_bisim.cli.options import check_writable, command_parser, parse, set_threads
 from sb3_robust_bisim.cli.record import check_video
 from sb3_robust_bisim.cli.settings import StoreSettings
-from sb3_robust_bisim.cli.zoo_config import DEFAULT_CONFIG, is_yaml
+from sb3_robust_bisim.cli.train_options import train_arguments
 from sb3_robust_bisim.runs.allocator import keep_freed_memory
 
 ALGOS[ALGO] = BisimSAC
@@ -46,8 +43,6 @@ COMMANDS = {
     "plot_from_file": "draw what all_plots has collected",
     "all_plots": "draw and collect the evaluations of runs",
 }
-CHANGED = "rl-zoo3's command with these options changed or added:"
-SET_BY_THE_USER = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OMP_WAIT_POLICY")
 
 
 def shell(program: str = "robust-bisim") -> None:
@@ -72,7 +67,7 @@ def main(arguments: Sequence[str] | None = None, program: str = "robust-bisim") 
         sys.exit(0 if asked else 2)
     program = f"{program} {command}"
     if command == "train":
-        ours, theirs = _train_arguments(program, options)
+        ours, theirs = train_arguments(program, options)
         manager = partial(BisimExperimentManager, ours)
         keep_freed_memory()
         with (
@@ -159,111 +154,19 @@ def _sigterm_as_ctrl_c() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
 
 
-def _train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, list[str]]:
-    """Split the arguments of `train` into the options that rl-zoo3 does not have, and rl-zoo3's with our defaults."""
-    parser = _parser(program)
-    parser.add_argument("--env", help="task, for example robust_bisim/SparseCartPole-v0")
-    parser.add_argument(
-        *("--variant", "--variants"),
-        dest="variants",
-        nargs="+",
-        default=[],
-        metavar="NAME",
-        help="variants in the config file that override the settings of the task, for example DBC, or SAC clean small",
-    )
-    parser.add_argument(
-        "--checkpoint",
-        type=Path,
-        metavar="FILE",
-        help="save the complete state of the run to this file. After an interruption, the same command continues from it and "
-        "gives the same numbers as an uninterrupted run. The log folder and the progress bar stay as they were. Delete the "
-        "file to start again",
-    )
-    parser.add_argument(
-        "--new-episodes",
-        action="store_true",
-        help="continue from a checkpoint of other package versions or of a machine with more GPUs: with its agent, replay "
-        "buffer and counters, but in new episodes and with a new log folder. The numbers differ from an uninterrupted run",
-    )
-    parser.add_argument(
-        "--checkpoint-freq",
-        type=int,
-        default=10_000,
-        metavar="N",
-        help="environment steps between two checkpoints (default: %(default)s)",
-    )
-    parser.add_argument(
-        "-n", "--n-timesteps", type=int, help="environment steps of the run, at least 1 (default: as in the config file)"
-    )
-    parser.add_argument("--seed", type=int, help="seed of environments, networks and sampling (default: a random one)")
-    parser.add_argument("-conf", "--conf-file", help=f"file with hyperparameters (default for {ALGO}: {DEFAULT_CONFIG})")
-    ours, theirs = _parse(parser, arguments)
-    if ours.env is not None:
-        theirs += ["--env", ours.env]
-    if not any(argument in ("-h", "--help") or argument.startswith("--gym-p") for argument in arguments):
-        if ours.env is None:
-            parser.error("--env: name the task.")
-        if ours.env not in gym.registry:
-            guess = closest(ours.env, gym.registry, ".")
-            parser.error(f"--env {ours.env}: no such task{guess} If your package registers it, add --gym-packages.")
-    if ours.checkpoint_freq < 1:
-        parser.error(f"--checkpoint-freq {ours.checkpoint_freq}: must be at least 1.")
-    if ours.n_timesteps is not None and ours.n_timesteps < 1:  # rl-zoo3 would take the config file's
-        parser.error(f"--n-timesteps {ours.n_timesteps}: must be at least 1. Without it, the config file's number counts.")
-    _check_theirs(parser, theirs)
-    if ours.new_episodes and ours.checkpoint is None:
-        parser.error("--new-episodes: needs --checkpoint FILE.")
-    if ours.checkpoint is not None:
-        _check_writable(parser, "--checkpoint", ours.checkpoint)
-    config = ours.conf_file or (str(DEFAULT_CONFIG) if ours.algo == ALGO else None)
-    if config is not None and is_yaml(config) and not Path(config).is_file():
-        parser.error(f"-conf {config}: there is no such file.")
-    if config is not None:
-        theirs += ["-conf", config]
-    for option in ("seed", "n_timesteps"):
-        if (value := getattr(ours, option)) is not None:
-            theirs += [f"--{option.replace('_', '-')}", str(value)]
-    seed_given = ours.seed is not None and ours.seed >= 0
-    options = RunOptions(tuple(ours.variants), ours.checkpoint, ours.checkpoint_freq, ours.new_episodes, seed_given)
-    return options, theirs
-
-
-def _check_theirs(parser: argparse.ArgumentParser, arguments: list[str]) -> None:
-    """Refuse values of rl-zoo3's options that it ignores, or with which it fails after the start."""
-    theirs = argparse.ArgumentParser(prog=parser.prog, add_help=False, allow_abbrev=False, usage=argparse.SUPPRESS)
-    for option in ("--eval-episodes", "--n-eval-envs", "--n-trials"):
-        theirs.add_argument(option, type=int, default=1)
-    theirs.add_argument("-i", "--trained-agent", type=Path)
-    theirs.add_argument("--device", default="auto")
-    for option in ("--trial-id", "--storage", "--study-name"):
-        theirs.add_argument(option)
-    given, _ = theirs.parse_known_args(arguments)
-    for option in ("eval_episodes", "n_eval_envs", "n_trials"):
-        if (value := getattr(given, option)) < 1:
-            parser.error(f"--{option.replace('_', '-')} {value}: must be at least 1.")
-    if given.trained_agent is not None and not given.trained_agent.is_file():
-        parser.error(f"-i {given.trained_agent}: there is no such file. Pass the .zip of a saved agent.")
-    if given.trial_id is not None and not (given.storage and given.study_name):
-        parser.error(f"--trial-id {given.trial_id}: needs --storage and --study-name.")
-    try:
-        get_device(given.device)
-    except RuntimeError:
-        parser.error(f"--device {given.device}: torch knows no such device. Use cpu, cuda or auto.")
-
-
 def _enjoy(program: str, arguments: list[str]) -> None:
     """
     Play the latest run with a saved agent, where rl-zoo3 takes the latest folder; or an agent that comes with the package.
     With --video, one episode goes to a file, which rl-zoo3 cannot do.
     """
-    parser = _parser(program)
+    parser = command_parser(program)
     folder = parser.add_mutually_exclusive_group()
     folder.add_argument("-f", "--folder", default="logs", help="folder with the runs (default: %(default)s)")
     folder.add_argument("--trained", action="store_true", help="play the trained agent that comes with the package")
     parser.add_argument("--exp-id", type=int, default=0, help="number of the run (default: the latest one with an agent)")
     parser.add_argument("--env", type=EnvironmentName, default=None, help="task")
     parser.add_argument("--video", type=Path, metavar="FILE", help="write one episode to an .mp4 or .gif, without a window")
-    ours, theirs = _parse(parser, arguments)
+    ours, theirs = parse(parser, arguments)
     if {"-h", "--help"} & set(arguments):  # rl-zoo3 prints the other half, and exits
         with _replaced(sys, "argv", [program, "--help"]):
             rl_zoo3.enjoy.enjoy()
@@ -297,7 +200,7 @@ def _enjoy(program: str, arguments: list[str]) -> None:
 
 def _run_to_play(program: str, arguments: list[str], folder: str) -> int:
     """The number of the run whose agent `enjoy` is to play; rl-zoo3 would end with a traceback if there is none."""
-    parser = _parser(program)
+    parser = command_parser(program)
     add_agent_arguments(parser)
     args, _ = parser.parse_known_args(arguments)
     args.folder = folder
@@ -306,7 +209,7 @@ def _run_to_play(program: str, arguments: list[str], folder: str) -> int:
 
 def _video_arguments(program: str, arguments: list[str]) -> argparse.Namespace:
     """Parse the arguments of `enjoy --video`, and stop with a message before any work if no video can be written."""
-    parser = _parser(program, "Write a video of one episode.")
+    parser = command_parser(program, "Write a video of one episode.")
     add_agent_arguments(parser)
     parser.add_argument("--trained", action="store_true")
     parser.add_argument("--video", type=Path)
@@ -319,64 +222,16 @@ def _video_arguments(program: str, arguments: list[str]) -> argparse.Namespace:
         check_video(args.video)
     except (ValueError, ImportError) as error:
         parser.error(f"--video {error}")
-    _check_writable(parser, "--video", args.video)
-    _set_threads(args)
+    check_writable(parser, "--video", args.video)
+    set_threads(args)
     return args
 
 
 def _evaluate_arguments(program: str, arguments: list[str]) -> argparse.Namespace:
     """Parse the arguments of `evaluate`, a command that rl-zoo3 does not have."""
-    parser = _parser(program, DESCRIPTION, add_help=True)
+    parser = command_parser(program, DESCRIPTION, add_help=True)
     add_arguments(parser)
     args = parser.parse_args(arguments)
     check_arguments(parser, args)
-    _set_threads(args)
+    set_threads(args)
     return args
-
-
-def _parser(program: str, description: str = CHANGED, add_help: bool = False) -> argparse.ArgumentParser:
-    """The options that all commands have, with a new meaning or a new default for those of rl-zoo3."""
-    parser = argparse.ArgumentParser(prog=program, add_help=add_help, allow_abbrev=False, description=description)
-    parser.add_argument("--algo", default=ALGO, help="RL algorithm (default: %(default)s)")
-    parser.add_argument(
-        "--num-threads",
-        type=int,
-        help="number of CPU threads of torch; -1 leaves the choice to torch, which may be faster on an idle machine. The "
-        "default is 1, which is faster beside other work: torch's threads wait actively and slow each other down. If one of "
-        f"{', '.join(SET_BY_THE_USER)} is set, the default is -1",
-    )
-    return parser
-
-
-def _parse(parser: argparse.ArgumentParser, arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
-    """Parse our options. The rest is for rl-zoo3, with ``--algo`` and ``--num-threads`` filled in."""
-    if {"-h", "--help"} & set(arguments):
-        parser.print_help()
-        print("\nAll options of rl-zoo3:\n")
-    ours, theirs = parser.parse_known_args(arguments)
-    return ours, ["--algo", ours.algo, "--num-threads", str(_n_threads(ours)), *theirs]
-
-
-def _n_threads(args: argparse.Namespace) -> int:
-    """The number of torch threads; -1: torch chooses."""
-    if args.num_threads is not None:
-        return args.num_threads
-    return -1 if any(name in os.environ for name in SET_BY_THE_USER) else 1
-
-
-def _set_threads(args: argparse.Namespace) -> None:
-    """For the commands that are not rl-zoo3's."""
-    if (n_threads := _n_threads(args)) > 0:
-        th.set_num_threads(n_threads)
-
-
-def _check_writable(parser: argparse.ArgumentParser, option: str, file: Path) -> None:
-    """Report before any work what would otherwise fail at the end."""
-    if file.is_dir():
-        parser.error(f"{option} {file}: this is a folder; name a file in it.")
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=file.parent):
-            pass
-    except OSError as error:
-        parser.error(f"{option} {file}: {error.strerror}; name a file in a folder with write access.")

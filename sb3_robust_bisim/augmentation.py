@@ -41,5 +41,5 @@ def _by_index(images: th.Tensor, offsets: th.Tensor) -> th.Tensor:
     samples = th.arange(len(images))[:, None, None]
     rows = (offsets[:, :1] + th.arange(height)).clamp_(0, height - 1)[:, :, None]
     columns = (offsets[:, 1:] + th.arange(width)).clamp_(0, width - 1)[:, None, :]
-    indices = (index.to(images.device, non_blocking=True) for index in (samples, rows, columns))
+    indices = (index.to(images.device, non_blocking=images.is_cuda) for index in (samples, rows, columns))
     return images.movedim(1, -1)[tuple(indices)].movedim(-1, 1)

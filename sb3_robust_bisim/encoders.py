@@ -65,6 +65,8 @@ class Encoder(BaseFeaturesExtractor):
             assert isinstance(obs, th.Tensor)
             dtype = th.bfloat16 if self.bf16 else th.float32  # 0..255 are exact in both
             return obs.contiguous(memory_format=th.channels_last).to(dtype, copy=True).div_(255)
+        if isinstance(obs, th.Tensor):
+            obs = obs.contiguous()  # others may use views, and images that have been shifted are channels last
         return preprocess_obs(obs, self._observation_space, self.normalize_images)
 
     def forward(self, preprocessed: PyTorchObs) -> th.Tensor:

@@ -5,7 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from small_models import dicts, images, make_model, pendulum
+from stable_baselines3.common.envs import FakeImageEnv
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
 from sb3_robust_bisim import BisimSAC
 from sb3_robust_bisim.augmentation import _by_copy, _by_index, random_shift
@@ -60,6 +63,22 @@ def test_training_shifts_both_observations_apart_and_acting_does_not() -> None:
     seen.clear()
     model.predict(data.observations.numpy())
     assert th.equal(seen[0], original)
+
+
+class Views(BaseFeaturesExtractor):
+    """As users write one: `view` needs the usual order in memory."""
+
+    def __init__(self, observation_space: spaces.Box) -> None:
+        super().__init__(observation_space, 50)
+        self.linear = th.nn.Linear(int(np.prod(observation_space.shape)), 50)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.linear(observations.view(len(observations), -1))
+
+
+def test_other_encoders_get_shifted_images_in_the_usual_order_in_memory() -> None:
+    env = FakeImageEnv(screen_height=12, screen_width=12, n_channels=3, discrete=False)
+    make_model("CnnPolicy", env, random_shift=4, policy_kwargs=dict(features_extractor_class=Views)).learn(12)
 
 
 def test_without_a_shift_the_batch_stays_as_it_is() -> None:

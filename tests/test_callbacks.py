@@ -21,7 +21,7 @@ from sb3_robust_bisim import BisimSAC
 from sb3_robust_bisim.callbacks import DenoisingFactorCallback, EmbeddingCallback, ValueBoundCallback, diagnostic
 from sb3_robust_bisim.callbacks.denoising import denoising_factor
 from sb3_robust_bisim.callbacks.embedding import _pca_figure
-from sb3_robust_bisim.cli import zoo
+from sb3_robust_bisim.cli import zoo, zoo_config
 from sb3_robust_bisim.envs import NoiseObservation
 from sb3_robust_bisim.runs.checkpoint import Checkpoint, load_checkpoint
 
@@ -381,7 +381,7 @@ def test_callbacks_that_cannot_work_are_refused_when_training_starts(callback: B
 
 
 def test_the_zoo_shows_why_training_did_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    content = yaml.safe_load(zoo.DEFAULT_CONFIG.read_text())
+    content = yaml.safe_load(zoo_config.DEFAULT_CONFIG.read_text())
     content[NOISY] |= {"callback": "sb3_robust_bisim.callbacks.ValueBoundCallback", "c_r": 0.0, "norm_constraint": False}
     (tmp_path / "config.yml").write_text(yaml.dump(content))
     monkeypatch.setattr("sys.argv", ["sb3_robust_bisim"])

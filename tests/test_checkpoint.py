@@ -29,7 +29,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
 from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer, IntrinsicRewardVecEnv
-from sb3_robust_bisim.cli import zoo
+from sb3_robust_bisim.cli import zoo, zoo_config
 from sb3_robust_bisim.runs.atomic import atomic_path
 from sb3_robust_bisim.runs.checkpoint import Checkpoint, load_checkpoint, read_about, save_checkpoint
 from sb3_robust_bisim.runs.hashed_file import replaced
@@ -411,7 +411,7 @@ def test_the_command_line_refuses_the_checkpoint_of_another_run(
 
 
 def test_a_checkpoint_is_refused_if_the_config_evaluates_differently(command: list[str], tmp_path: Path) -> None:
-    config = yaml.safe_load(zoo.DEFAULT_CONFIG.read_text())
+    config = yaml.safe_load(zoo_config.DEFAULT_CONFIG.read_text())
     config["robust_bisim/SparseCartPole-v0"]["eval_env_kwargs"] = {"theta_rew_fraction": 0.5}
     (tmp_path / "other.yml").write_text(yaml.dump(config))
     with pytest.raises(ValueError, match=r"eval_env_kwargs is .*1\.0.* there and .*0\.5.* here"):
@@ -443,6 +443,17 @@ def test_the_command_line_continues_another_versions_checkpoint_in_new_episodes(
     assert "New episodes and a new log folder, because it was written with other versions" in printed
     assert "Going on from step 50" in printed
     assert len(list(tmp_path.glob("bisim_sac/*/0.monitor.csv"))) == 2
+
+
+def test_a_run_moves_to_another_device_in_new_episodes(
+    command: list[str], capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match="belongs to another run: device is auto there and cpu here"):
+        zoo.main([*command, "--seed", "3", "--device", "cpu"])
+    zoo.main([*command, "--seed", "3", "--device", "cpu", "--new-episodes"])
+    printed = capsys.readouterr().out
+    assert "New episodes and a new log folder, because it was written with --device auto" in printed
+    assert "Going on from step 50" in printed
 
 
 def test_the_command_line_continues_environments_in_other_processes(

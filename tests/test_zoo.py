@@ -23,9 +23,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_robust_bisim import BisimSAC, FrameStackReplayBuffer
 from sb3_robust_bisim.cli.errors import UsageError, refusals
 from sb3_robust_bisim.cli.manager import BisimExperimentManager, sample_bisim_sac_params
+from sb3_robust_bisim.cli.options import SET_BY_THE_USER
 from sb3_robust_bisim.cli.report import report
 from sb3_robust_bisim.cli.settings import StoreSettings
-from sb3_robust_bisim.cli.options import SET_BY_THE_USER
 from sb3_robust_bisim.cli.zoo import COMMANDS, main, shell
 from sb3_robust_bisim.cli.zoo_config import check_keys, variant_settings
 
@@ -470,7 +470,7 @@ def test_a_checkpoint_that_another_process_writes_is_refused(zoo: Zoo, tmp_path:
         ("-i", "nothere.zip", "-i nothere.zip: there is no such file. Pass the .zip of a saved agent."),
         ("--trial-id", "3", "--trial-id 3: needs --storage and --study-name."),
         ("--device", "gpu", "--device gpu: not here (Expected one of cpu, cuda"),
-        ("--device", "cuda", "--device cuda: not here (Torch not compiled with CUDA"),
+        ("--device", "cuda:99", "--device cuda:99: not here ("),
         ("--checkpoint-freq", "500", "--checkpoint-freq: needs --checkpoint FILE."),
         ("--num-threads", "0", "argument --num-threads: 0 must be at least 1, or -1"),
         ("--tensorboard-log", "/dev/null/tb", "--tensorboard-log /dev/null/tb: /dev/null Not a directory; name a folder"),

@@ -226,16 +226,20 @@ class BisimExperimentManager(ExperimentManager):
         about = read_about(checkpoint)
         if "settings" not in about:
             raise UsageError(f"--checkpoint {checkpoint}: saved from Python, not by this command. Continue it in Python.")
-        if differing := differences(about["settings"], self._settings(saved_hyperparams)):
+        here, there, reason = self._settings(saved_hyperparams), about["settings"], obstacle(about)
+        if self.options.new_episodes and here["device"] != there["device"]:
+            reason = reason or f"it was written with --device {there['device']}"
+            there = {**there, "device": here["device"]}
+        if differing := differences(there, here):
             raise UsageError(
                 f"--checkpoint {checkpoint}: belongs to another run: {differing}. Name another file, or delete it."
             )
         _, self.env_wrapper, _, self.vec_env_wrapper = self._preprocess_hyperparams(hyperparams)
         if self.n_timesteps < about["num_timesteps"]:
             raise UsageError(f"--n-timesteps {self.n_timesteps}: {checkpoint} is at step {about['num_timesteps']} already.")
-        if self.options.new_episodes and (reason := obstacle(about)):
+        if self.options.new_episodes and reason:
             new_model, saved_hyperparams = self._begin(checkpoint)
-            model, _ = load_checkpoint(checkpoint, env=new_model.env)
+            model, _ = load_checkpoint(checkpoint, env=new_model.env, device=self.device)
             print(f"New episodes and a new log folder, because {reason}")
         else:
             model, run = load_checkpoint(checkpoint)

@@ -38,8 +38,9 @@ def train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, lis
     parser.add_argument(
         "--new-episodes",
         action="store_true",
-        help="continue from a checkpoint of other package versions or of a machine with more GPUs: with its agent, replay "
-        "buffer and counters, but in new episodes and with a new log folder. The numbers differ from an uninterrupted run",
+        help="continue from a checkpoint of other package versions, of another --device or of a machine with more GPUs: with "
+        "its agent, replay buffer and counters, but in new episodes and with a new log folder. The numbers differ from an "
+        "uninterrupted run",
     )
     parser.add_argument(
         "--checkpoint-freq",

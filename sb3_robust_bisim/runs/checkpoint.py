@@ -121,7 +121,7 @@ def obstacle(about: Mapping[str, Any]) -> str:
     return ""
 
 
-def load_checkpoint(path: str | Path, env: VecEnv | None = None) -> tuple[Any, Any]:
+def load_checkpoint(path: str | Path, env: VecEnv | None = None, device: th.device | str = "auto") -> tuple[Any, Any]:
     """
     Load a model, and restore the global random generators.
 
@@ -135,6 +135,7 @@ def load_checkpoint(path: str | Path, env: VecEnv | None = None) -> tuple[Any, A
         the run continues from the previous one
     :param env: new environments, to continue without exactness: the agent, its optimizers, replay buffer, counters and the
         statistics of ``VecNormalize`` are loaded, and new episodes begin. The context and the random generators are not loaded
+    :param device: of the agent in new environments; without ``env``, it is the one that the agent had
     :return: the model with its environments and its replay buffer, and the context (None with ``env``)
     :raises ValueError: if the file is not a checkpoint or damaged; without ``env``, if it was written with other package
         versions or with more GPUs; with an ``env`` of another number of environments
@@ -149,7 +150,7 @@ def load_checkpoint(path: str | Path, env: VecEnv | None = None) -> tuple[Any, A
         unpickler = pickle.Unpickler(file)
         parts = unpickler.load()
         if env is not None:
-            return _with_new_episodes(parts, env), None
+            return _with_new_episodes(parts, env, device), None
         model, context, generators, rollout_begun = unpickler.load()
     model._custom_logger = False  # so that learn() creates a logger
     _link_batch_norm(model)
@@ -221,11 +222,11 @@ def _without_environment(model: BaseAlgorithm) -> tuple[Any, ...]:
     model.save(agent)
     normalize = model.get_vec_normalize_env()
     statistics = None if normalize is None else (normalize.obs_rms, normalize.ret_rms)
-    return type(model), agent.getvalue(), model.device.type, getattr(model, "replay_buffer", None), statistics
+    return type(model), agent.getvalue(), getattr(model, "replay_buffer", None), statistics
 
 
-def _with_new_episodes(parts: tuple[Any, ...], env: VecEnv) -> BaseAlgorithm:
-    algorithm, agent, device, replay_buffer, statistics = parts
+def _with_new_episodes(parts: tuple[Any, ...], env: VecEnv, device: th.device | str) -> BaseAlgorithm:
+    algorithm, agent, replay_buffer, statistics = parts
     if replay_buffer is not None and replay_buffer.n_envs != env.num_envs:
         raise ValueError(
             f"env with num_envs={env.num_envs}: the checkpoint has a replay buffer for {replay_buffer.n_envs} environments. "

@@ -371,7 +371,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=joblib.cpu_count(), help="local processes (default: %(default)s)")
     parser.add_argument("--device", default="cpu", help="of every run; on one GPU --jobs 1 or a few (default: %(default)s)")
     parser.add_argument(
-        "--vec-env", choices=("dummy", "subproc"), default="dummy", help="subproc: each environment in a process"
+        "--vec-env", choices=("dummy", "subproc"), default="dummy", help="subproc: in processes (default: %(default)s)"
     )
     parser.add_argument("--backend", choices=("loky", "dask"), default="loky", help="local processes, or a Dask cluster")
     parser.add_argument("--scheduler", help="address of the Dask scheduler, host:port; its workers need --nthreads 1")

@@ -1,4 +1,4 @@
-"""Updates that never wait for the device: what is logged stays there until the end, and distributions are not checked."""
+"""Updates that wait for no result of the device: what is logged stays there until the end, distributions are not checked."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

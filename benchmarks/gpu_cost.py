@@ -1,11 +1,11 @@
 """
 What does a gradient step from pixels cost on a GPU?
 
-Methods with the settings of zoo_configs/: the paper's (84x84 pixels) and the variant `small` (64x64, random shift), batches of
-128 and 512, fp32 and bf16; on GPUs, torch computes fp32 convolutions in TF32. `SB3` is its SAC with the same encoder and replay buffer. It
-does not shift, and updates the actor at every step, not at every second one. All arms are interleaved in one
-process; the times are medians over the rounds, and the ratios are computed within each round. `cpu` is one thread of the same
-machine, in a few rounds.
+Methods with the settings of zoo_configs/: the paper's (84x84 pixels) and the variant `small` (64x64, random shift), batches
+of 128 and 512, fp32 and bf16; on GPUs, torch computes fp32 convolutions in TF32. `SB3` is its SAC with the same encoder and
+replay buffer. It does not shift, and updates the actor at every step, not at every second one. All arms are interleaved in
+one process; the times are medians over the rounds, and the ratios are computed within each round. `cpu` is one thread of the
+same machine, in a few rounds.
 
 `kernels_ms` is how long the GPU computes in an update. In the rest, Python samples the batch, copies it and starts kernels.
 `kernels_ms_not_deterministic` is the same without SB3's choice of deterministic convolutions. The last line printed is one

@@ -194,20 +194,20 @@ def begin(folder: Path, measured: dict) -> dict:
     """Clear away what cannot be gone on with, and say which code and machine the run is made with."""
     path = folder / "measured.json"
     if (folder / "checkpoint.pkl").exists() or (folder / "trained.json").exists():
-        measured = both(json.loads(path.read_text()) if path.exists() else {}, measured)
+        measured = history(json.loads(path.read_text()) if path.exists() else {}, measured)
     else:
         shutil.rmtree(folder)
     write(path, json.dumps(measured))
     return measured
 
 
-def both(before: dict, now: dict) -> dict:
-    """What differs between two measurements of a run is in the result twice."""
+def history(before: dict, now: dict) -> dict:
+    """The measurements of a run; where a value has changed, "old, then new"."""
     said = {}
     for key, value in now.items():
         earlier = before.get(key, {} if isinstance(value, dict) else "unknown")
         if isinstance(value, dict):
-            said[key] = both(earlier, value)
+            said[key] = history(earlier, value)
         else:
             said[key] = earlier if earlier.split(", then ")[-1] == value else f"{earlier}, then {value}"
     return said

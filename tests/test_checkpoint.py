@@ -446,14 +446,17 @@ def test_the_command_line_continues_another_versions_checkpoint_in_new_episodes(
 
 
 def test_a_run_moves_to_another_device_in_new_episodes(
-    command: list[str], capsys: pytest.CaptureFixture, tmp_path: Path
+    command: list[str], capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    load, devices = BisimSAC.load, []
+    monkeypatch.setattr(BisimSAC, "load", lambda *args, device, **kwargs: devices.append(device) or load(*args, **kwargs))
     with pytest.raises(ValueError, match="belongs to another run: device is auto there and cpu here"):
         zoo.main([*command, "--seed", "3", "--device", "cpu"])
     zoo.main([*command, "--seed", "3", "--device", "cpu", "--new-episodes"])
     printed = capsys.readouterr().out
     assert "New episodes and a new log folder, because it was written with --device auto" in printed
     assert "Going on from step 50" in printed
+    assert devices == ["cpu"]
 
 
 def test_the_command_line_continues_environments_in_other_processes(

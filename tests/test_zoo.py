@@ -469,12 +469,12 @@ def test_a_checkpoint_that_another_process_writes_is_refused(zoo: Zoo, tmp_path:
         ("--n-trials", "0", "--n-trials 0: must be at least 1."),
         ("-i", "nothere.zip", "-i nothere.zip: there is no such file. Pass the .zip of a saved agent."),
         ("--trial-id", "3", "--trial-id 3: needs --storage and --study-name."),
-        ("--device", "gpu", "--device gpu: not here (Expected one of cpu, cuda"),
-        ("--device", "cuda:99", "--device cuda:99: not here ("),
+        ("--device", "gpu", "--device gpu: no such device here (Expected one of cpu, cuda"),
+        ("--device", "cuda:99", "--device cuda:99: no such device here ("),
         ("--checkpoint-freq", "500", "--checkpoint-freq: needs --checkpoint FILE."),
-        ("--num-threads", "0", "argument --num-threads: 0 must be at least 1, or -1"),
-        ("--tensorboard-log", "/dev/null/tb", "--tensorboard-log /dev/null/tb: /dev/null Not a directory; name a folder"),
-        ("--log-folder", "/dev/null/logs", "--log-folder /dev/null/logs: /dev/null Not a directory; name a folder"),
+        ("--num-threads", "0", "argument --num-threads: 0 must be an integer of at least 1, or -1"),
+        ("--tensorboard-log", "/dev/null/tb", "--tensorboard-log /dev/null/tb: Not a directory; name a folder"),
+        ("--log-folder", "/dev/null/logs", "--log-folder /dev/null/logs: Not a directory; name a folder"),
     ],
 )
 def test_a_run_that_could_not_work_is_refused(zoo: Zoo, option: str, value: str, message: str, tmp_path: Path) -> None:
@@ -483,6 +483,23 @@ def test_a_run_that_could_not_work_is_refused(zoo: Zoo, option: str, value: str,
     assert stop.value.code == 2
     assert message in zoo.output
     assert not (tmp_path / "logs").exists()
+
+
+def test_help_needs_no_folder_to_write_to(zoo: Zoo) -> None:
+    with pytest.raises(SystemExit) as stop:
+        zoo("train", "-f", "/dev/null/logs", "--help")
+    assert stop.value.code == 0
+    assert "--n-eval-envs" in zoo.output
+
+
+def test_a_folder_behind_a_locked_one_is_named(zoo: Zoo, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(path: Path) -> bool:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr("sb3_robust_bisim.cli.options.Path.exists", refuse)
+    with pytest.raises(SystemExit):
+        zoo("train", "--env", CARTPOLE, "-f", "locked/logs")
+    assert "--log-folder locked/logs: Permission denied; name a folder with write access." in zoo.output
 
 
 def test_a_missing_config_file_is_named(zoo: Zoo) -> None:

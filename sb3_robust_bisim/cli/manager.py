@@ -232,7 +232,8 @@ class BisimExperimentManager(ExperimentManager):
             there = {**there, "device": here["device"]}
         if differing := differences(there, here):
             raise UsageError(
-                f"--checkpoint {checkpoint}: belongs to another run: {differing}. Name another file, or delete it."
+                f"--checkpoint {checkpoint}: belongs to another run: {differing}. Name another file, or delete it. "
+                "--new-episodes allows another --device."
             )
         _, self.env_wrapper, _, self.vec_env_wrapper = self._preprocess_hyperparams(hyperparams)
         if self.n_timesteps < about["num_timesteps"]:

@@ -38,10 +38,9 @@ def parse(parser: argparse.ArgumentParser, arguments: list[str]) -> tuple[argpar
 
 def _threads(text: str) -> int:
     """A number of threads; rl-zoo3 ignores what is below 1."""
-    number = int(text)
-    if number < 1 and number != -1:
-        raise argparse.ArgumentTypeError(f"{text} must be at least 1, or -1")
-    return number
+    if not text.removeprefix("-").isdecimal() or (int(text) < 1 and int(text) != -1):
+        raise argparse.ArgumentTypeError(f"{text} must be an integer of at least 1, or -1")
+    return int(text)
 
 
 def _n_threads(args: argparse.Namespace) -> int:
@@ -52,7 +51,7 @@ def _n_threads(args: argparse.Namespace) -> int:
 
 
 def set_threads(args: argparse.Namespace) -> None:
-    """For the commands that are not rl-zoo3's."""
+    """Set torch's number of threads; rl-zoo3's commands do this themselves."""
     if (n_threads := _n_threads(args)) > 0:
         th.set_num_threads(n_threads)
 
@@ -71,9 +70,9 @@ def check_writable(parser: argparse.ArgumentParser, option: str, file: Path) -> 
 
 def check_folder(parser: argparse.ArgumentParser, option: str, folder: Path) -> None:
     """The same for a folder, which is made only when there is something to put into it."""
-    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     try:
+        existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
         with tempfile.TemporaryFile(dir=existing):
             pass
     except OSError as error:
-        parser.error(f"{option} {folder}: {existing} {error.strerror}; name a folder with write access.")
+        parser.error(f"{option} {folder}: {error.strerror}; name a folder with write access.")

@@ -12,8 +12,6 @@ from sb3_robust_bisim.cli.manager import ALGO, RunOptions
 from sb3_robust_bisim.cli.options import check_folder, check_writable, command_parser, parse
 from sb3_robust_bisim.cli.zoo_config import DEFAULT_CONFIG, is_yaml
 
-CHECKPOINT_FREQ = 10_000
-
 
 def train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, list[str]]:
     """Split the arguments of `train` into the options that rl-zoo3 does not have, and rl-zoo3's with our defaults."""
@@ -46,7 +44,7 @@ def train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, lis
         "--checkpoint-freq",
         type=int,
         metavar="N",
-        help=f"environment steps between two checkpoints (default: {CHECKPOINT_FREQ})",
+        help=f"environment steps between two checkpoints (default: {RunOptions.checkpoint_freq})",
     )
     parser.add_argument(
         "-n", "--n-timesteps", type=int, help="environment steps of the run, at least 1 (default: as in the config file)"
@@ -56,7 +54,8 @@ def train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, lis
     ours, theirs = parse(parser, arguments)
     if ours.env is not None:
         theirs += ["--env", ours.env]
-    if not any(argument in ("-h", "--help") or argument.startswith("--gym-p") for argument in arguments):
+    asks_for_help = bool({"-h", "--help"} & set(arguments))
+    if not asks_for_help and not any(argument.startswith("--gym-p") for argument in arguments):
         if ours.env is None:
             parser.error("--env: name the task.")
         if ours.env not in gym.registry:
@@ -66,7 +65,8 @@ def train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, lis
         parser.error(f"--checkpoint-freq {ours.checkpoint_freq}: must be at least 1.")
     if ours.n_timesteps is not None and ours.n_timesteps < 1:  # rl-zoo3 would take the config file's
         parser.error(f"--n-timesteps {ours.n_timesteps}: must be at least 1. Without it, the config file's number counts.")
-    _check_theirs(parser, theirs)
+    if not asks_for_help:
+        _check_theirs(parser, theirs)
     for option in ("new_episodes", "checkpoint_freq"):
         if getattr(ours, option) and ours.checkpoint is None:
             parser.error(f"--{option.replace('_', '-')}: needs --checkpoint FILE.")
@@ -81,7 +81,7 @@ def train_arguments(program: str, arguments: list[str]) -> tuple[RunOptions, lis
         if (value := getattr(ours, option)) is not None:
             theirs += [f"--{option.replace('_', '-')}", str(value)]
     seed_given = ours.seed is not None and ours.seed >= 0
-    checkpoint_freq = ours.checkpoint_freq or CHECKPOINT_FREQ
+    checkpoint_freq = ours.checkpoint_freq or RunOptions.checkpoint_freq
     options = RunOptions(tuple(ours.variants), ours.checkpoint, checkpoint_freq, ours.new_episodes, seed_given)
     return options, theirs
 
@@ -105,11 +105,11 @@ def _check_theirs(parser: argparse.ArgumentParser, arguments: list[str]) -> None
         parser.error(f"-i {given.trained_agent}: there is no such file. Pass the .zip of a saved agent.")
     if given.trial_id is not None and not (given.storage and given.study_name):
         parser.error(f"--trial-id {given.trial_id}: needs --storage and --study-name.")
-    try:
+    try:  # SB3 takes the CPU in place of a missing GPU
         th.empty(0, device=get_device() if given.device == "auto" else given.device)
-    except (RuntimeError, AssertionError) as error:  # SB3 takes the CPU where there is no GPU
+    except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
-        parser.error(f"--device {given.device}: not here ({reason}). Use cpu, or auto for a GPU if there is one.")
+        parser.error(f"--device {given.device}: no such device here ({reason}). Use cpu, or auto for a GPU if there is one.")
     check_folder(parser, "--log-folder", given.log_folder)
     if given.tensorboard_log is not None:
         check_folder(parser, "--tensorboard-log", given.tensorboard_log)

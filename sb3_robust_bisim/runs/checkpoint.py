@@ -226,7 +226,7 @@ def _without_environment(model: BaseAlgorithm) -> tuple[Any, ...]:
 
 
 def _with_new_episodes(parts: tuple[Any, ...], env: VecEnv, device: th.device | str) -> BaseAlgorithm:
-    algorithm, agent, replay_buffer, statistics = parts
+    algorithm, agent, *_, replay_buffer, statistics = parts  # earlier versions had the device in between
     if replay_buffer is not None and replay_buffer.n_envs != env.num_envs:
         raise ValueError(
             f"env with num_envs={env.num_envs}: the checkpoint has a replay buffer for {replay_buffer.n_envs} environments. "
